@@ -23,6 +23,7 @@ from efficientnerf.backends.numba.tree import contributions, queries
 from efficientnerf.backends.numba.tree.cells import cells_of as tree_cells
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.geometry.directions import across
 from efficientnerf.rendering import environment
 from efficientnerf.rendering.colour import sigmoid
 from efficientnerf.rendering.harmonics import C0, basis_numpy
@@ -184,7 +185,7 @@ def _gaussians_of_cells(tree: NerfTree, shown: Shown, begin: np.ndarray, degree:
         for j in range(i + 1):
             spread[:, i, j] = spread[:, j, i] = np.add.reduceat(off[:, i] * off[:, j] * shown.pixels, first) / weight
     spread += np.eye(3) * (side**2 / 12)[:, None, None]
-    axes, scales = flattened(spread, _normals(tree, mean), side)
+    axes, scales = flattened(spread, np.asarray(queries.normal_at(tree, mean), np.float64), side)
     thickness = THICKER * np.add.reduceat(tree.density_values[shown.voxels] * shown.sides**3, first) / (2 * np.pi * scales[:, 0] * scales[:, 1])
     opacities = np.clip(-np.expm1(-thickness), 0.02, 0.98)
     if tree.ndc is not None:
@@ -193,11 +194,6 @@ def _gaussians_of_cells(tree: NerfTree, shown: Shown, begin: np.ndarray, degree:
     _convert(tree, shown, begin, weight, harmonics, degree)
     parts = mean, scales, quaternions_from(axes), opacities, harmonics
     return Gaussians(*(np.ascontiguousarray(part, np.float32) for part in parts))
-
-
-def _normals(tree: NerfTree, points: np.ndarray) -> np.ndarray:
-    """(C, 3) down the density's gradient, in the frame; zero where it is flat."""
-    return np.asarray(queries.normal_at(tree, points), np.float64)
 
 
 def flattened(spread: np.ndarray, normals: np.ndarray, side: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -209,10 +205,7 @@ def flattened(spread: np.ndarray, normals: np.ndarray, side: np.ndarray) -> tupl
     own = np.linalg.eigh(spread).eigenvectors  # by ascending variance
     normal = np.where((np.square(normals).sum(axis=1) > 0.5)[:, None], normals, own[:, :, 0])
     # The widest direction across the normal: the covariance within that plane, as two numbers and an angle.
-    helper = np.where(np.abs(normal[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
-    first = np.cross(helper, normal)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(normal, first)
+    first, second = across(normal)
 
     def along(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return np.asarray(np.einsum("ni,nij,nj->n", a, spread, b))
@@ -220,9 +213,9 @@ def flattened(spread: np.ndarray, normals: np.ndarray, side: np.ndarray) -> tupl
     angle = 0.5 * np.arctan2(2 * along(first, second), along(first, first) - along(second, second))
     cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
     first, second = cosine * first + sine * second, cosine * second - sine * first
-    across = [WIDEN * np.sqrt(np.maximum(along(axis, axis), 0)) for axis in (first, second)]
+    widths = [WIDEN * np.sqrt(np.maximum(along(axis, axis), 0)) for axis in (first, second)]
     deep = np.maximum(np.sqrt(np.maximum(along(normal, normal) - side**2 / 12, 0)), THIN * side)
-    return np.stack([first, second, normal], axis=-1), np.stack([*across, deep], axis=-1)
+    return np.stack([first, second, normal], axis=-1), np.stack([*widths, deep], axis=-1)
 
 
 def _in_the_world(tree: NerfTree, mean: np.ndarray, axes: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -269,9 +262,7 @@ def environment_shell(tree: NerfTree, most: int, degree: int) -> Gaussians:
     bounds = cascades_of(tree)[-1].bounds(tree.brick)
     distance = SHELL_DISTANCE * np.linalg.norm(bounds[1] - bounds[0]) / 2
     directions = _directions(count) if count else np.zeros((0, 3))
-    first = np.cross(np.where(np.abs(directions[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]), directions)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    axes = np.stack([first, np.cross(directions, first), directions], axis=-1)
+    axes = np.stack([*across(directions), directions], axis=-1)
     spacing = distance * np.sqrt(4 * np.pi / max(count, 1))
     harmonics = np.zeros((count, (degree + 1) ** 2, 3))
     if count and tree.environment is not None:

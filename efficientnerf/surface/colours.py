@@ -1,28 +1,21 @@
-"""Colours of surface points, as seen from outside. K directions, S samples."""
-
-from collections.abc import Callable
+"""Colours of surface points, as seen from outside. S samples."""
 
 import numpy as np
 
 from efficientnerf.surface.isosurface import Progress, silent
 from efficientnerf.surface.volume import Volume
 
-ViewDirections = Callable[[np.ndarray, np.ndarray], list[np.ndarray]]
 CHUNK = 1 << 16  # points whose colours are looked up at a time
 
 
-def surface_colours(
-    volume: Volume, positions: np.ndarray, normals: np.ndarray, progress: Progress = silent, view_directions: ViewDirections | None = None
-) -> np.ndarray:
+def surface_colours(volume: Volume, positions: np.ndarray, normals: np.ndarray, progress: Progress = silent) -> np.ndarray:
     """(N, 3) float32 sRGB of surface points, as seen from outside.
 
     Along the inward normal, from one voxel in front of the point to two behind it, colours are weighted as a ray would weigh them: a single
-    sample on the surface mixes with the colour of empty voxels. Each is the median over six viewing directions, one head on and five at
-    45 degrees, so that neither a highlight nor a direction without training views decides; or over those that `view_directions` gives for
-    points and normals.
+    sample on the surface mixes with the colour of empty voxels. Each is the median over the volume's view directions.
     """
     colours = np.empty((len(positions), 3), np.float32)
-    steps = np.linspace(-1.0, 2.0, 7) * float(volume.voxel)  # (S,)
+    steps = np.linspace(-1.0, 2.0, 7) * float(volume.tree.voxel)  # (S,)
     for start in range(0, len(positions), CHUNK):
         part = slice(start, start + CHUNK)
         progress(start, len(positions), "colours")
@@ -36,20 +29,10 @@ def surface_colours(
         share = np.take_along_axis(weight, best, 1)
         chosen = np.take_along_axis(samples, best[..., None], 1).reshape(-1, 3)
         views = []
-        for direction in outside_directions(normal) if view_directions is None else view_directions(point, normal):
+        for direction in volume.view_directions(point, normal):
             along = np.repeat(direction, best.shape[1], 0)
             found = np.asarray(volume.colour(chosen, along), np.float64).reshape(-1, best.shape[1], 3)
             views.append((found * share[..., None]).sum(1) / share.sum(1, keepdims=True))
         colours[part] = np.clip(np.median(views, 0), 0, 1)
     progress(len(positions), len(positions), "colours")
     return colours
-
-
-def outside_directions(normal: np.ndarray) -> list[np.ndarray]:
-    """K unit ray directions (N, 3) each, towards a surface with these outward normals."""
-    helper = np.where(np.abs(normal[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
-    first = np.cross(helper, normal)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(normal, first)
-    slanted = [-(normal + np.cos(angle) * first + np.sin(angle) * second) * np.sqrt(0.5) for angle in np.arange(5) * (2 * np.pi / 5)]
-    return [-normal, *slanted]

@@ -15,14 +15,14 @@ from efficientnerf.surface.isosurface import NoSurface, Progress, automatic_thre
 from efficientnerf.surface.mesh import Mesh, decimate, separate, tidy, vertex_normals
 from efficientnerf.surface.smoothing import FUSED_NORMALS, NORMALS, rounds_of, smooth, smooth_normals
 from efficientnerf.surface.visible_parts import Shown, visible_parts
-from efficientnerf.surface.volume import NdcVolume, Volume
+from efficientnerf.surface.volume import Volume
 
 
 def cleaned_surface(
-    volume: Volume, threshold: float | None, min_component: float, rounds: int, viewpoints: np.ndarray, progress: Progress, shown: Shown | None = None,
-    fusion: Fusion | None = None,
+    volume: Volume, threshold: float | None, min_component: float, rounds: int, viewpoints: np.ndarray, progress: Progress, shown: Shown | None,
+    fusion: Fusion | None,
 ) -> tuple[np.ndarray, np.ndarray, dict[str, object]]:  # fmt: skip
-    """Vertices, faces and facts of the surface before it is decimated; see `surface`."""
+    """Vertices, faces and facts of the surface before it is decimated; see `surface`. `shown` takes components of the volume's frame."""
     level = automatic_threshold(volume) if threshold is None else float(threshold)
     if not (np.isfinite(level) and level > 0):
         raise NoSurface(f"threshold {level:g}: expected a density above zero")
@@ -30,22 +30,14 @@ def cleaned_surface(
     vertices, faces = isosurface(volume, level, progress, enclosed=enclosed if enclosed.any() else None, fusion=fusion)
     if not len(faces):
         raise NoSurface(f"the density nowhere reaches {level:.4g} per unit")
-    vertices, faces, facts = visible_parts(vertices, faces, min_component, viewpoints, _in_world(volume, shown))
+    vertices, faces, facts = visible_parts(vertices, faces, min_component, shown)
     if not len(faces):
         raise NoSurface(f"no view shows anything of the surface at {level:.4g} per unit")
     vertices = np.clip(smooth(vertices, faces, rounds), vertices.min(0), vertices.max(0))  # flat sides must not bulge out of the box
     return vertices, faces, {"threshold": level, "threshold_chosen": "automatic" if threshold is None else "given", **facts}
 
 
-def _in_world(volume: Volume, shown: Shown | None) -> Shown | None:
-    """`shown` for components of the volume's frame."""
-    if shown is None or not isinstance(volume, NdcVolume):
-        return shown
-    ndc = volume.ndc
-    return lambda vertices, faces, component: shown(ndc.world(vertices), faces, component)
-
-
-_NO_VIEWPOINTS = np.zeros((0, 3))
+NO_VIEWPOINTS = np.zeros((0, 3))
 
 
 def surface(
@@ -55,7 +47,7 @@ def surface(
     faces: int = 200_000,
     min_component: float = 0.01,
     rounds: int = 10,
-    viewpoints: np.ndarray = _NO_VIEWPOINTS,
+    viewpoints: np.ndarray = NO_VIEWPOINTS,
     shown: Shown | None = None,
     fusion: Fusion | None = None,
     silhouettes: Sequence[AssetView] = (),
@@ -68,7 +60,7 @@ def surface(
     min_component  components with less than this share of the largest one's area are removed
     rounds         of smoothing, which keeps the volume; those of smoothing normals, which keep edges, are NORMALS or FUSED_NORMALS
     viewpoints     (N, 3) camera positions that may lie inside the volume: what can be seen from there is not filled
-    shown          how much views of the world show of components: those that they do not show are removed; None: hollows and parts in them are
+    shown          how much views of the world show of components: those that they do not show are removed; None: all stay
     fusion         depths of views, which decide where the surface is wherever they agree; None: the densities alone do
     silhouettes    views of the asset by pinhole cameras, whose silhouettes the surface gets where it is sharply curved
     progress       called with (done, total, text); what it raises stops the work
@@ -77,17 +69,15 @@ def surface(
 
     Raises NoSurface.
     """
-    ndc = volume if isinstance(volume, NdcVolume) else None
-    viewpoints = viewpoints if ndc is None else _NO_VIEWPOINTS  # the cameras are before the near plane, outside of the volume
-    vertices, triangles, facts = cleaned_surface(volume, threshold, min_component, rounds, viewpoints, progress, shown, fusion)
+    seen = None if shown is None else (lambda places, triangles, component: shown(volume.world(places), triangles, component))
+    inside = volume.inner(viewpoints)
+    vertices, triangles, facts = cleaned_surface(volume, threshold, min_component, rounds, inside, progress, seen, fusion)
     facts["faces_before_decimation"] = len(triangles)
     vertices, triangles = separate(*tidy(*decimate(vertices, triangles, faces)))
-    vertices, triangles, _ = visible_parts(vertices, triangles, min_component, viewpoints, _in_world(volume, shown))  # parts that decimation cut off
+    vertices, triangles, _ = visible_parts(vertices, triangles, min_component, seen)  # without parts that decimation cut off
     if len(triangles):
         low, high = vertices.min(0), vertices.max(0)
         vertices = smooth_normals(vertices, triangles, *rounds_of(NORMALS if fusion is None else FUSED_NORMALS, rounds, vertices, triangles))
         vertices = np.clip(fitted_to_silhouettes(vertices, triangles, silhouettes, lambda: progress(0, 1, "colours")), low, high)
     normals = vertex_normals(vertices, triangles)
-    colours = surface_colours(volume, vertices, normals, progress, None if ndc is None else ndc.view_directions)
-    mesh = Mesh(vertices, triangles, normals, colours, facts)
-    return mesh if ndc is None else ndc.mesh(mesh)
+    return volume.in_world(Mesh(vertices, triangles, normals, surface_colours(volume, vertices, normals, progress), facts))

@@ -29,16 +29,12 @@ def silent(done: int, total: int, text: str) -> None:
     pass
 
 
-def _grid(volume: Volume) -> np.ndarray:
-    return np.asarray(volume.shape, np.int64) * int(volume.brick)  # (3,) voxels per axis
-
-
 def pool_of(volume: Volume) -> int:
     """Voxels along a side of the cells in which enclosed space is found: two; more where that were over 256 cells a side, for the memory.
 
     Of grids beyond the sides that are baked, which may be a line of cells, the least that makes no more than 256^3 cells.
     """
-    grid = _grid(volume)
+    grid = np.asarray(volume.tree.resolution)
     pool = 2 * max(1, -(-int(grid.max()) // 512))
     if grid.max() > LARGEST_SIDE:
         pool = next(each for each in range(2, pool + 1, 2) if each == pool or np.prod(-(-grid // each)) <= 256**3)
@@ -58,7 +54,7 @@ def automatic_threshold(volume: Volume) -> float:
 
     Raises NoSurface where no ray loses half its light.
     """
-    grid, brick, voxel = _grid(volume), int(volume.brick), float(volume.voxel)
+    grid, brick, voxel = np.asarray(volume.tree.resolution), volume.tree.brick, volume.tree.voxel
     found, highest = [], 0.0
     for axis in range(3):
         first, second = (other for other in range(3) if other != axis)
@@ -67,7 +63,7 @@ def automatic_threshold(volume: Volume) -> float:
                 low, high = np.zeros(3, np.int64), grid.copy()
                 low[first], low[second] = i * brick, j * brick
                 high[first], high[second] = low[first] + brick, low[second] + brick
-                blocks = [np.asarray(volume.density_block(*part)) for part in volume.filled_parts(axis, low, high)]
+                blocks = [volume.density_block(*part) for part in volume.filled_parts(axis, low, high)]
                 if not blocks:
                     continue
                 block = np.concatenate(blocks, axis)
@@ -100,7 +96,7 @@ def enclosed_cells(volume: Volume, threshold: float, viewpoints: np.ndarray) -> 
 
     A cell counts as dense if one of its voxels is, so that light does not creep in through pinholes of the size of a voxel.
     """
-    grid, pool = _grid(volume), pool_of(volume)
+    grid, pool = np.asarray(volume.tree.resolution), pool_of(volume)
     cells = -(-grid // pool)
     dense = np.zeros(cells + 2, bool)  # an empty cell all around: the outside
     for voxels in volume.dense_voxels(threshold):
@@ -108,7 +104,7 @@ def enclosed_cells(volume: Volume, threshold: float, viewpoints: np.ndarray) -> 
     region = np.empty(dense.shape, np.int32)
     label(~dense, output=region)
     outside = {int(region[0, 0, 0])}
-    at = np.floor((viewpoints - np.asarray(volume.bounds_min)) / (float(volume.voxel) * pool)).astype(np.int64)  # (N, 3)
+    at = np.floor((viewpoints - volume.tree.bounds_min) / (volume.tree.voxel * pool)).astype(np.int64)  # (N, 3)
     at = at[((at >= 0) & (at < cells)).all(1)] + 1
     outside |= set(region[tuple(at.T)].tolist())
     return (~dense & ~np.isin(region, list(outside)))[1:-1, 1:-1, 1:-1]
@@ -121,15 +117,15 @@ def _filled_block(volume: Volume, low: np.ndarray, high: np.ndarray, threshold: 
     into pinholes, which it fills. The margin that is read makes the result the same for both blocks that share a plane.
     """
     if enclosed is None:
-        return np.asarray(volume.density_block(low, high))
+        return volume.density_block(low, high)
     margin = pool_of(volume) + 1
     axes = [np.arange(a - margin, b + margin) // pool_of(volume) for a, b in zip(low, high)]
     known = [(axis >= 0) & (axis < count) for axis, count in zip(axes, enclosed.shape)]
     seed = enclosed[np.ix_(*(np.clip(axis, 0, count - 1) for axis, count in zip(axes, enclosed.shape)))]
     seed &= known[0][:, None, None] & known[1][:, None] & known[2]
     if not seed.any():
-        return np.asarray(volume.density_block(low, high))
-    sigma = np.asarray(volume.density_block(low - margin, high + margin))
+        return volume.density_block(low, high)
+    sigma = volume.density_block(low - margin, high + margin)
     filled = binary_dilation(seed, iterations=margin, mask=sigma < threshold)
     return np.where(filled, np.float32(np.inf), sigma)[margin:-margin, margin:-margin, margin:-margin]
 
@@ -146,7 +142,7 @@ def isosurface(
     Marching cubes (Lewiner's, by scikit-image) runs on the opacity f = 1 - 2^(-sigma / threshold) at level 1/2 instead of on sigma: densities
     jump from nothing to hundreds within a voxel, and vertices interpolated on them would all sit at the same end of their edges.
     """
-    grid = _grid(volume)
+    grid = np.asarray(volume.tree.resolution)
     starts = [np.arange(-1, grid[axis], block) for axis in range(3)]
     blocks = volume.filled_blocks([len(each) for each in starts], block)
     positions, faces, seams, joined, count = [], [], [], [], 0
@@ -159,7 +155,7 @@ def isosurface(
         if opacity.max() <= EMPTY:  # nothing is fused there
             continue
         if fusion is not None:
-            opacity = fused_opacity(fusion, opacity, low - margin, volume.bounds_min, volume.voxel)[margin:-margin, margin:-margin, margin:-margin]
+            opacity = fused_opacity(fusion, opacity, low - margin, volume.tree.bounds_min, volume.tree.voxel)[margin:-margin, margin:-margin, margin:-margin]
         opacity = _dithered(_clipped(volume, opacity, low), low)
         if opacity.min() > 0.5 or opacity.max() < 0.5:
             continue
@@ -180,7 +176,7 @@ def isosurface(
     grid_points, triangles = compact(np.concatenate(positions), target[np.concatenate(faces)])
     # Sample i lies at the middle of voxel i. The lids at the boundary must not stand out of the box.
     grid_points = np.clip(grid_points + 0.5, 0, grid)
-    return np.asarray(volume.bounds_min, np.float64) + grid_points * float(volume.voxel), triangles
+    return volume.tree.bounds_min + grid_points * volume.tree.voxel, triangles
 
 
 def _opacity(sigma: np.ndarray, threshold: float) -> np.ndarray:
@@ -190,18 +186,18 @@ def _opacity(sigma: np.ndarray, threshold: float) -> np.ndarray:
 
 def _clipped(volume: Volume, opacity: np.ndarray, low: np.ndarray) -> np.ndarray:
     """Opacities of voxels from `low` on without those outside of the volume's region."""
-    region = volume.region
+    region, voxel = volume.region, volume.tree.voxel
     if region is None:
         return opacity
 
     # The region is a column: distances are the lesser of those in plan and in height, each taken where the other is greatest.
     middle = np.asarray(region.bounds, np.float64).mean(axis=0)
-    x, y, z = (start + (first + np.arange(side) + 0.5) * volume.voxel for start, first, side in zip(volume.bounds_min, low, opacity.shape))
+    x, y, z = (start + (first + np.arange(side) + 0.5) * voxel for start, first, side in zip(volume.tree.bounds_min, low, opacity.shape))
     plan = inside_distance(region, np.stack([*np.broadcast_arrays(x[:, None], y, middle[2])], -1).reshape(-1, 3)).reshape(*opacity.shape[:2], 1)
     height = inside_distance(region, np.stack(np.broadcast_arrays(middle[0], middle[1], z), -1))
-    if min(plan.min(), height.min()) > region.fade / 2 + CLIP * volume.voxel:
+    if min(plan.min(), height.min()) > region.fade / 2 + CLIP * voxel:
         return opacity
-    beyond = (region.fade / 2 - np.minimum(plan, height)) / volume.voxel
+    beyond = (region.fade / 2 - np.minimum(plan, height)) / voxel
     return np.minimum(opacity, np.clip(0.5 - beyond / (2 * CLIP), 0, 1).astype(np.float32))
 
 

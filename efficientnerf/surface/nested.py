@@ -6,7 +6,7 @@ voxels differ by a factor of two, there may be cracks of about a voxel.
 F faces.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from efficientnerf.asset.cascades import cascade_sides, cascade_tree, cascades_o
 from efficientnerf.asset.tree import Cascade, NerfTree, Region
 from efficientnerf.surface.agreement import AssetView
 from efficientnerf.surface.extraction import surface
-from efficientnerf.surface.fusion import Fusion, fusion_of
+from efficientnerf.surface.fusion import fusion_of
 from efficientnerf.surface.isosurface import NoSurface, Progress
 from efficientnerf.surface.mesh import Mesh, face_areas
 from efficientnerf.surface.visible_parts import Shown
@@ -39,23 +39,26 @@ def scene_surface(
 
     Raises NoSurface where no cascade has any.
     """
-    if not tree.outer:
+    fused = _cascades_of_region(tree, region)
+
+    def surface_of(number: int, part: NerfTree, budget: int) -> Mesh:
+        # Cascades after the first `fused` may hold parts of a few voxels, and fused distances are smoothed over more than one.
+        fusion = fusion_of(part, views, lambda: progress(0, 1, "marching cubes")) if views and number < fused else None
         return surface(
-            volume_of(tree, region), threshold, faces=faces, min_component=min_component, rounds=rounds, viewpoints=viewpoints, shown=shown,
-            fusion=_fusion(0, tree, views, 1, progress), silhouettes=() if tree.ndc else views[::SKIPPED], progress=progress,
+            volume_of(part, region), None if threshold is None else threshold / 2.0**number, faces=budget, min_component=min_component, rounds=rounds,
+            viewpoints=viewpoints, shown=shown, fusion=fusion, silhouettes=views[::SKIPPED] if number == 0 and tree.ndc is None else (), progress=progress,
         )  # fmt: skip
-    found, fused = [], _cascades_of_region(tree, region)
+
+    if not tree.outer:
+        return surface_of(0, tree, faces)
+    found = []
     sizes = np.bincount(voxel_cascades(tree), minlength=len(cascades_of(tree)))
-    for number, part in _parts(tree):
-        share = faces * len(part.density_values) // len(tree.density_values)
-        if share < MIN_FACES and number != int(sizes.argmax()):
+    for number, size in enumerate(sizes.tolist()):
+        share = faces * size // len(tree.density_values)
+        if not size or (share < MIN_FACES and number != int(sizes.argmax())):
             continue
         try:
-            mesh = surface(
-                volume_of(part, region), _level(threshold, number), faces=share, min_component=min_component, rounds=rounds, viewpoints=viewpoints,
-                shown=shown, fusion=_fusion(number, part, views, fused, progress), silhouettes=views[::SKIPPED] if number == 0 else (),
-                progress=progress,
-            )  # fmt: skip
+            mesh = surface_of(number, cascade_tree(tree, number), share)
         except NoSurface:
             continue
         found.append((mesh, _visible(tree, number, mesh.vertices, mesh.faces)))
@@ -76,19 +79,6 @@ def face_sizes(tree: NerfTree, vertices: np.ndarray, faces: np.ndarray) -> np.nd
     return face_areas(vertices, faces) / sides**2
 
 
-def _parts(tree: NerfTree) -> Iterator[tuple[int, NerfTree]]:
-    """The cascades that hold anything, with their numbers."""
-    for number in range(len(cascades_of(tree))):
-        part = cascade_tree(tree, number)
-        if len(part.density_values):
-            yield number, part
-
-
-def _fusion(number: int, tree: NerfTree, views: Sequence[AssetView], fused: int, progress: Progress) -> Fusion | None:
-    """Of one of the first `fused` cascades. Those after them may hold parts of a few voxels, and fused distances are smoothed over more than one."""
-    return fusion_of(tree, views, lambda: progress(0, 1, "marching cubes")) if views and number < fused else None
-
-
 def _cascades_of_region(tree: NerfTree, region: Region | None) -> int:
     """How many cascades hold the foreground region, but for a voxel of the last; 1 without a region."""
     cascades = cascades_of(tree)
@@ -97,10 +87,6 @@ def _cascades_of_region(tree: NerfTree, region: Region | None) -> int:
         if region is None or ((region.bounds[0] >= low - cascade.voxel) & (region.bounds[1] <= high + cascade.voxel)).all():
             return count
     return len(cascades)
-
-
-def _level(threshold: float | None, number: int) -> float | None:
-    return None if threshold is None else threshold / 2.0**number
 
 
 def _visible(tree: NerfTree, number: int, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ import numpy as np
 from efficientnerf.asset import queries
 from efficientnerf.asset.tree import NerfTree, Region
 from efficientnerf.backends.numba.tree import queries as frame_queries
+from efficientnerf.geometry.directions import outside_directions
 from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.surface.mesh import Mesh, vertex_normals
 
@@ -22,28 +23,12 @@ VOXELS_AT_ONCE = 2**20  # of bricks, while dense voxels are found
 FARTHEST = 50.0  # times the near plane's depth: the far limit where the asset does not say
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Volume:
     """A tree, its points in its own frame."""
 
     tree: NerfTree
     region: Region | None = field(default=None, kw_only=True)  # that surfaces are clipped to, half way into the band in which opacity fades; None: not at all
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        return self.tree.shape
-
-    @property
-    def brick(self) -> int:
-        return int(self.tree.brick)
-
-    @property
-    def voxel(self) -> float:
-        return float(self.tree.voxel)
-
-    @property
-    def bounds_min(self) -> np.ndarray:
-        return np.asarray(self.tree.bounds_min)
 
     def density_block(self, low: Any, high: Any) -> np.ndarray:
         """Density at the voxel centres low <= (i, j, k) < high, zero outside of the grid."""
@@ -52,32 +37,33 @@ class Volume:
     @cached_property
     def cells(self) -> np.ndarray:
         """(B, 3) coarse cells that own a brick, in order: density is nowhere else. A grid may be vast, and nearly empty."""
-        return np.stack(np.unravel_index(np.flatnonzero(self.tree.brick_index.reshape(-1) >= 0), self.shape), axis=1)
+        return np.stack(np.unravel_index(np.flatnonzero(self.tree.brick_index.reshape(-1) >= 0), self.tree.shape), axis=1)
 
     def dense_voxels(self, threshold: float) -> Iterator[np.ndarray]:
         """(M, 3) voxels of at least this density, above zero, some bricks at a time."""
-        tree, each = self.tree, max(1, VOXELS_AT_ONCE // self.brick**3)
+        tree, brick = self.tree, self.tree.brick
+        each = max(1, VOXELS_AT_ONCE // brick**3)
         bricks = tree.brick_index[tuple(self.cells.T)]
         for begin in range(0, len(bricks), each):
             voxel = tree.voxel_index[bricks[begin : begin + each]]
             dense = voxel >= 0
             dense[dense] = tree.density_values[voxel[dense]] >= threshold
-            brick, local = np.nonzero(dense)
-            yield self.cells[begin + brick] * self.brick + np.stack(np.unravel_index(local, (self.brick,) * 3), axis=1)
+            owner, local = np.nonzero(dense)
+            yield self.cells[begin + owner] * brick + np.stack(np.unravel_index(local, (brick,) * 3), axis=1)
 
     def filled_parts(self, axis: int, low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Corners of the parts of a column of bricks along `axis` that may have density; gaps do not count in its rays' depth."""
         others = [other for other in range(3) if other != axis]
-        at = np.unique(self.cells[(self.cells[:, others] == low[others] // self.brick).all(axis=1), axis])
+        at = np.unique(self.cells[(self.cells[:, others] == low[others] // self.tree.brick).all(axis=1), axis])
         for run in np.split(at, np.flatnonzero(np.diff(at) > 1) + 1) if len(at) else ():
             begin, end = low.copy(), high.copy()
-            begin[axis], end[axis] = run[0] * self.brick, (run[-1] + 1) * self.brick
+            begin[axis], end[axis] = run[0] * self.tree.brick, (run[-1] + 1) * self.tree.brick
             yield begin, end
 
     def filled_blocks(self, counts: list[int], block: int) -> np.ndarray:
         """(n, 3) numbers of the blocks that may hold a part of the surface, in order: those with a brick, and those next to them, where enclosed space may
         end."""
-        at = np.unique(self.cells * self.brick // block, axis=0)
+        at = np.unique(self.cells * self.tree.brick // block, axis=0)
         flat = np.zeros(0, np.int64)
         for offset in np.argwhere(np.ones((3, 3, 3), bool)) - 1:
             beside = at + offset
@@ -93,8 +79,25 @@ class Volume:
         """sRGB (N, 3) at points of the frame, along unit directions of the world."""
         return frame_queries.colour_at(self.tree, points, directions)
 
+    def view_directions(self, points: np.ndarray, normals: np.ndarray) -> list[np.ndarray]:
+        """Unit directions (N, 3) of the world that colours at points with these outward normals, of the frame, are looked up along: six from outside, so that
+        neither a highlight nor a direction without training views decides."""
+        return outside_directions(normals)
 
-@dataclass(frozen=True, eq=False)
+    def world(self, points: np.ndarray) -> np.ndarray:
+        """Points (N, 3) of the frame in the world."""
+        return points
+
+    def in_world(self, mesh: Mesh) -> Mesh:
+        """A mesh of the frame in the world."""
+        return mesh
+
+    def inner(self, viewpoints: np.ndarray) -> np.ndarray:
+        """Those of the viewpoints (N, 3) of the world that may lie in the volume, in its frame."""
+        return viewpoints
+
+
+@dataclass(eq=False)
 class NdcVolume(Volume):
     """A tree in normalised device coordinates; see `Volume`."""
 
@@ -104,7 +107,7 @@ class NdcVolume(Volume):
     def layers(self) -> int:
         """How many layers of voxels along z' lie before the far limit."""
         far = float((self.tree.metadata.get("spiral") or {}).get("far", FARTHEST * self.ndc.near))
-        return int(np.floor((1 - 2 * self.ndc.near / far - self.bounds_min[2]) / self.voxel))
+        return int(np.floor((1 - 2 * self.ndc.near / far - self.tree.bounds_min[2]) / self.tree.voxel))
 
     def density_block(self, low: Any, high: Any) -> np.ndarray:
         """Zero from the far limit on, too."""
@@ -117,18 +120,25 @@ class NdcVolume(Volume):
         return (found[found[:, 2] < self.layers] for found in super().dense_voxels(threshold))
 
     def view_directions(self, points: np.ndarray, normals: np.ndarray) -> list[np.ndarray]:
-        """Unit view directions (N, 3) of the world to points of the frame, from the reference camera and from about as far to the sides, above and below it as
-        the cameras were. From elsewhere nothing is known of the colours, whatever the normals are."""
+        """From the reference camera and from about as far to the sides, above and below it as the cameras were: from elsewhere nothing is known of the colours,
+        whatever the normals are."""
         x, y, _ = (self.tree.metadata.get("spiral") or {}).get("radii", (0.0, 0.0, 0.0))
         places = np.array([[0, 0, 0], [x, 0, 0], [-x, 0, 0], [0, y, 0], [0, -y, 0]], np.float64)
         centres = places @ self.ndc.world_from_camera[:3, :3].T + self.ndc.world_from_camera[:3, 3]
         away = [self.ndc.world(np.asarray(points, np.float64)) - centre for centre in centres]
         return [each / np.maximum(np.linalg.norm(each, axis=1, keepdims=True), 1e-12) for each in away]
 
-    def mesh(self, mesh: Mesh) -> Mesh:
-        """A mesh of the frame in the world. The map keeps the handedness, so that faces stay outside out."""
+    def world(self, points: np.ndarray) -> np.ndarray:
+        return np.asarray(self.ndc.world(points))
+
+    def in_world(self, mesh: Mesh) -> Mesh:
+        """The map keeps the handedness, so that faces stay outside out."""
         vertices = self.ndc.world(mesh.vertices)
         return replace(mesh, vertices=vertices, normals=vertex_normals(vertices, mesh.faces))
+
+    def inner(self, viewpoints: np.ndarray) -> np.ndarray:
+        """None: the cameras are before the near plane."""
+        return viewpoints[:0]
 
 
 def volume_of(tree: NerfTree, region: Region | None = None) -> Volume:

@@ -7,19 +7,16 @@ import numpy as np
 
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.surface.colours import CHUNK, surface_colours
+from efficientnerf.surface.isosurface import Progress
 from efficientnerf.surface.mesh import Mesh, Texture, vertex_normals
 from efficientnerf.surface.texturing.atlas import Atlas, atlas_of
 from efficientnerf.surface.texturing.filling import texture_from
-from efficientnerf.surface.volume import NdcVolume, volume_of
+from efficientnerf.surface.volume import volume_of
 
 TEXELS_PER_VOXEL = 1.5
 
 
-def silent(done: int, total: int, text: str) -> None:
-    """Progress that is not reported."""
-
-
-def texture_of_asset(tree: NerfTree, mesh: Mesh, *, largest: int = 2048, progress: Callable[[int, int, str], None] = silent) -> Mesh:
+def texture_of_asset(tree: NerfTree, mesh: Mesh, *, largest: int, progress: Progress) -> Mesh:
     """The mesh with a texture that shows the colours of the tree that it was made of, and facts on that.
 
     mesh     in the training frame, as `efficientnerf.surface.nested.scene_surface` gives it; turn and scale it afterwards (`surface.mesh.moved`)
@@ -31,12 +28,11 @@ def texture_of_asset(tree: NerfTree, mesh: Mesh, *, largest: int = 2048, progres
     return replace(mesh, texture=Texture(atlas.coordinates, texture), facts=mesh.facts | facts)
 
 
-def asset_colours(tree: NerfTree, mesh: Mesh, atlas: Atlas, progress: Callable[[int, int, str], None] = silent) -> np.ndarray:
+def asset_colours(tree: NerfTree, mesh: Mesh, atlas: Atlas, progress: Progress) -> np.ndarray:
     """(T, 3) uint8 sRGB of the tree at the texels of a mesh of the training frame."""
     volume, texels = volume_of(tree), atlas.texels
-    ndc = volume if isinstance(volume, NdcVolume) else None
     vertices = tree.frame.points(mesh.vertices)
-    normals = mesh.normals if ndc is None else vertex_normals(vertices, mesh.faces)
+    normals = mesh.normals if tree.ndc is None else vertex_normals(vertices, mesh.faces)
     out = np.empty((len(texels.place), 3), np.uint8)
     for start in range(0, len(out), CHUNK):
         part = slice(start, start + CHUNK)
@@ -44,7 +40,7 @@ def asset_colours(tree: NerfTree, mesh: Mesh, atlas: Atlas, progress: Callable[[
         normal = texels.values(normals, mesh.faces, part)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
         at = texels.values(vertices, mesh.faces, part)
-        found = surface_colours(volume, at, normal, view_directions=None if ndc is None else ndc.view_directions)
+        found = surface_colours(volume, at, normal)
         out[part] = np.round(found * 255).astype(np.uint8)
     progress(len(out), len(out), "texture")
     return out

@@ -11,6 +11,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from efficientnerf.backends.numba.mesh.charts import best_turns, grow, overlapping
+from efficientnerf.geometry.directions import across
 from efficientnerf.surface.mesh import face_neighbours, face_vectors
 
 SMOOTHING = 4  # rounds over neighbouring faces, of the normals that charts are grown by
@@ -86,7 +87,7 @@ def flattened(vertices: np.ndarray, faces: np.ndarray, chart: np.ndarray) -> Cha
     axes = np.stack([np.bincount(chart, vectors[:, k], minlength=count) for k in range(3)], 1)
     length = np.linalg.norm(axes, axis=1, keepdims=True)
     axes = np.where(length > 0, axes / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
-    right, up = plane(axes)
+    right, up = across(axes)
     at = vertices[faces]  # (F, 3, 3)
     places = np.stack([np.einsum("fci,fi->fc", at, right[chart]), np.einsum("fci,fi->fc", at, up[chart])], -1)  # (F, 3, 2)
     order = np.argsort(chart, kind="stable")
@@ -97,14 +98,6 @@ def flattened(vertices: np.ndarray, faces: np.ndarray, chart: np.ndarray) -> Cha
     low = np.full((count, 2), np.inf)
     np.minimum.at(low, chart, places.min(1))
     return Charts(chart, places - low[chart][:, None])
-
-
-def plane(axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors (C, 3) to the right and up, of planes with these normals; the three are right-handed."""
-    helper = np.where(np.abs(axes[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
-    right = np.cross(helper, axes)
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    return right, np.cross(axes, right)
 
 
 def _misplaced(charts: Charts, looked_at: np.ndarray, normals: np.ndarray, vectors: np.ndarray, grid: float) -> np.ndarray:

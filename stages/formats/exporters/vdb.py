@@ -27,9 +27,9 @@ from efficientnerf.asset.cascades import cascade_tree, cascades_of, voxel_coordi
 from efficientnerf.asset.queries import normal_at
 from efficientnerf.asset.region import voxel_centres
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.geometry.directions import outside_directions
 from efficientnerf.rendering.colour import linear_from_srgb
 from efficientnerf.rendering.harmonics import basis_numpy
-from efficientnerf.surface.colours import outside_directions
 from pipeline.errors import BadInput, UsageError
 from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, write_parts
 

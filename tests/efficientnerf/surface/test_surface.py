@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.surface.extraction import surface
 from efficientnerf.surface.isosurface import automatic_threshold, enclosed_cells, isosurface
 from efficientnerf.surface.mesh import (
@@ -20,18 +21,18 @@ from efficientnerf.surface.mesh import (
     topology,
 )
 from efficientnerf.surface.smoothing import smooth, smooth_normals, smoothed_face_normals
+from efficientnerf.surface.volume import Volume
 
 LEVEL = 40.0
 NOBODY = np.zeros((0, 3))
 
 
-class Balls:
-    """A volume whose density passes LEVEL on spheres: LEVEL * 2^(-distance / softness), capped. Colour: position / 2 + 1/2. No part of it is without."""
-
-    region = None
+class Balls(Volume):
+    """A volume whose density passes LEVEL on spheres: LEVEL * 2^(-distance / softness), capped. Colour: position / 2 + 1/2."""
 
     def __init__(self, *balls: tuple[tuple[float, float, float], float], cells: int = 16, softness: float = 0.03, hollow: float = 0.0) -> None:
-        self.shape, self.brick, self.voxel, self.bounds_min = (cells, cells, cells), 4, 2 / (4 * cells), np.full(3, -1.0)
+        nothing = np.zeros((0, 3), int), np.zeros(0), np.zeros((0, 1, 3))
+        super().__init__(tree_from_voxels((cells, cells, cells), 2 / (4 * cells), np.full(3, -1.0), *nothing, brick=4))
         self.balls, self.softness, self.hollow = balls, softness, hollow
 
     def density(self, at: np.ndarray) -> np.ndarray:
@@ -42,11 +43,11 @@ class Balls:
 
     def density_block(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high)), indexing="ij"), -1)
-        inside = ((index >= 0) & (index < np.array(self.shape) * self.brick)).all(-1)
-        return np.where(inside, self.density(self.bounds_min + (index + 0.5) * self.voxel), 0).astype(np.float32)
+        inside = ((index >= 0) & (index < self.tree.resolution)).all(-1)
+        return np.where(inside, self.density(self.tree.bounds_min + (index + 0.5) * self.tree.voxel), 0).astype(np.float32)
 
     def dense_voxels(self, threshold: float) -> Iterator[np.ndarray]:
-        yield np.argwhere(self.density_block(np.zeros(3, int), np.array(self.shape) * self.brick) >= threshold)
+        yield np.argwhere(self.density_block(np.zeros(3, int), np.array(self.tree.resolution)) >= threshold)
 
     def filled_parts(self, axis: int, low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         yield low, high
@@ -149,11 +150,11 @@ def test_smoothing_keeps_the_volume() -> None:
 def test_the_automatic_threshold_draws_what_is_opaque(softness: float) -> None:
     ball = Balls(((0, 0, 0), 0.5), softness=softness, cells=12)
     level = automatic_threshold(ball)
-    assert 0 < level <= np.log(2) / ball.voxel + 1e-9
+    assert 0 < level <= np.log(2) / ball.tree.voxel + 1e-9
     radius = 0.5 - softness * np.log2(level / LEVEL)
     if radius < 0.95:
         vertices, _ = isosurface(ball, level)
-        assert np.median(np.linalg.norm(vertices, axis=1)) == pytest.approx(radius, abs=ball.voxel)
+        assert np.median(np.linalg.norm(vertices, axis=1)) == pytest.approx(radius, abs=ball.tree.voxel)
 
 
 def test_points_are_spread_evenly_over_a_mesh_and_repeatably() -> None:
