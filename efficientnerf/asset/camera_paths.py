@@ -94,7 +94,7 @@ def pose_on_sphere(centre: Sequence[float], radius: float, azimuth: float, eleva
     return pose
 
 
-def turntable_poses(orbit: Orbit, frames: int, *, sway: float, rise: float | None = None) -> list[np.ndarray]:
+def turntable_poses(orbit: Orbit, frames: int, sway: float, rise: float | None) -> list[np.ndarray]:
     """A full circle; or, for a capture from one side, an ellipse of `sway` by `rise` degrees (None: half as much) about the mean camera. Both are closed."""
     turns = np.arange(frames) / frames
     rise = 0.5 * sway if rise is None else rise
@@ -227,20 +227,24 @@ def turntable_cameras(
     def needed(poses: list[np.ndarray]) -> float:
         return FIT_MARGIN * fitted_field_of_view(poses, points, width / height)[0]
 
-    poses = turntable_poses(orbit, frames, sway=amplitude, rise=rise)
+    poses = turntable_poses(orbit, frames, amplitude, rise)
     # Captures from one side have nothing beyond the borders of their images: without a region the camera keeps its distance, and the asset may be cropped.
     if radius is None and fov is None and not surroundings and (tree.region is not None or not orbit.forward_facing):
         for _ in range(60):
             if needed(poses) <= widest:
                 break
             orbit = replace(orbit, radius=1.1 * orbit.radius)
-            poses = turntable_poses(orbit, frames, sway=amplitude, rise=rise)
+            poses = turntable_poses(orbit, frames, amplitude, rise)
     half, drop = fitted_field_of_view(poses, points, width / height)
     half, drop = (min(widest, FIT_MARGIN * half), drop) if fov is None else (math.tan(math.radians(fov / 2)), 0.0)
-    focal = 0.5 * height / half
-    lens = (focal, width / 2, height / 2 - focal * drop)
-    cameras = [Camera(f"frame_{k:04d}", width, height, "SIMPLE_PINHOLE", lens, pose) for k, pose in enumerate(poses)]
+    cameras = _pinholes(poses, width, height, 0.5 * height / half, drop)
     return cameras if level is None else [Similarity(1.0, level.T, np.zeros(3)).camera(camera) for camera in cameras]
+
+
+def _pinholes(poses: Sequence[np.ndarray], width: int, height: int, focal: float, drop: float = 0.0) -> list[Camera]:
+    """Cameras with so many pixels as focal length, and a shift of the principal point as `fitted_field_of_view` gives it."""
+    lens = (focal, width / 2, height / 2 - focal * drop)
+    return [Camera(f"frame_{k:04d}", width, height, "SIMPLE_PINHOLE", lens, pose) for k, pose in enumerate(poses)]
 
 
 def _leave_out(unused: Callable[[str, str], object], path: str, **settings: float | None) -> None:
@@ -285,7 +289,7 @@ def _framed_orbit(
     return orbit, SWAY if sway is None else sway, rise
 
 
-def captured_cameras(tree: NerfTree, frames: int, width: int, height: int, fov: float | None = None) -> list[Camera]:
+def captured_cameras(tree: NerfTree, frames: int, width: int, height: int, fov: float | None) -> list[Camera]:
     """Cameras on the way of the captured ones, with about their field of view along the diagonal. Raises MetadataError where the asset keeps none."""
     captured = captured_of(tree.metadata)
     if captured is None:
@@ -293,15 +297,7 @@ def captured_cameras(tree: NerfTree, frames: int, width: int, height: int, fov: 
     focal = captured.focal * math.hypot(width, height) / math.hypot(captured.width, captured.height)
     if fov is not None:
         focal = 0.5 * height / math.tan(math.radians(fov / 2))
-    poses = captured_path(list(captured.poses), frames)
-    return [Camera(f"frame_{k:04d}", width, height, "SIMPLE_PINHOLE", (focal, width / 2, height / 2), pose) for k, pose in enumerate(poses)]
-
-
-def _checked(poses: list[np.ndarray]) -> list[np.ndarray]:
-    """Poses with which something can be seen. Raises MetadataError: an asset may state a spiral that ends in the point that it looks at."""
-    if not np.isfinite(poses).all():
-        raise MetadataError("asset: its spiral and its reference camera give no poses: two points coincide, or a number is too large. Bake it again.")
-    return poses
+    return _pinholes(captured_path(list(captured.poses), frames), width, height, focal)
 
 
 def _spiral_cameras(tree: NerfTree, ndc: Ndc, frames: int, width: int, height: int, fov: float | None) -> list[Camera]:
@@ -316,6 +312,7 @@ def _spiral_cameras(tree: NerfTree, ndc: Ndc, frames: int, width: int, height: i
     if len(radii) != 3 or not (np.abs([*radii, focus, across, down]) < LARGEST).all() or not min(focus, across, down) > SMALLEST:
         raise MetadataError(f"asset: its spiral is {str(given)[:200]}; expected three radii, a positive focus and two positive tangents. Bake it again.")
     half = SPIRAL_FOV_RATIO * min(down, across * height / width) if fov is None else math.tan(math.radians(fov / 2))
-    focal = 0.5 * height / half
-    poses = _checked(spiral_poses(ndc.world_from_camera, radii, focus, frames))
-    return [Camera(f"frame_{k:04d}", width, height, "SIMPLE_PINHOLE", (focal, width / 2, height / 2), pose) for k, pose in enumerate(poses)]
+    poses = spiral_poses(ndc.world_from_camera, radii, focus, frames)
+    if not np.isfinite(poses).all():  # the spiral may end in the point that it looks at
+        raise MetadataError("asset: its spiral and its reference camera give no poses: two points coincide, or a number is too large. Bake it again.")
+    return _pinholes(poses, width, height, 0.5 * height / half)

@@ -11,6 +11,7 @@ B bricks, N stored voxels of all cascades, R rays, L cascades.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,17 +22,29 @@ MAX_CASCADES = 16
 ALIGNED_CELLS = 4  # coarse cells of cascade 0 along an axis are a multiple of this, so that a box of twice the size has its cells on this one's faces
 
 
-def cascade_grids(bounds: np.ndarray, voxel: float, brick: int, count: int) -> list[tuple[tuple[int, int, int], float, np.ndarray]]:
-    """Shape, voxel side and corner (3,) of `count` cascades of which the innermost covers `bounds` (2, 3), with a margin where that does not fit its cells;
-    each box has twice the sides of the one before, about the same centre."""
+class Grid(NamedTuple):
+    """Where the voxels of a cascade lie."""
+
+    shape: tuple[int, int, int]  # coarse cells along x, y, z
+    voxel: float  # side of a voxel
+    bounds_min: np.ndarray  # (3,) float64 corner
+
+    def bounds(self, brick: int) -> np.ndarray:
+        """(2, 3) corners, for so many voxels along a coarse cell."""
+        return np.stack([self.bounds_min, self.bounds_min + np.asarray(self.shape) * brick * self.voxel])
+
+
+def cascade_grids(bounds: np.ndarray, voxel: float, brick: int, count: int) -> list[Grid]:
+    """`count` cascades of which the innermost covers `bounds` (2, 3), with a margin where that does not fit its cells; each box has twice the sides of the one
+    before, about the same centre."""
     bounds = np.asarray(bounds, np.float64)
     if count == 1:
         cells = np.ceil(np.round((bounds[1] - bounds[0]) / (voxel * brick), 6)).astype(int).clip(1)
-        return [((int(cells[0]), int(cells[1]), int(cells[2])), float(voxel), bounds[0].copy())]
+        return [Grid((int(cells[0]), int(cells[1]), int(cells[2])), float(voxel), bounds[0].copy())]
     cells = ALIGNED_CELLS * np.ceil(np.round((bounds[1] - bounds[0]) / (voxel * brick * ALIGNED_CELLS), 6)).astype(int).clip(1)
     centre = bounds.mean(axis=0)
     shape = (int(cells[0]), int(cells[1]), int(cells[2]))
-    return [(shape, voxel * 2.0**n, centre - cells * (brick * voxel * 2.0**n / 2)) for n in range(count)]
+    return [Grid(shape, voxel * 2.0**n, centre - cells * (brick * voxel * 2.0**n / 2)) for n in range(count)]
 
 
 def cascades_of(tree: NerfTree) -> tuple[Cascade, ...]:
@@ -44,19 +57,18 @@ def check_cascades(tree: NerfTree) -> None:
     cascades = cascades_of(tree)
     if len(cascades) > 1 and tree.ndc is not None:
         raise ValueError("cascades around normalised device coordinates, which reach to infinity themselves")
-    check_nesting([(cascade.shape, cascade.voxel, cascade.bounds_min) for cascade in cascades], tree.brick)
+    check_nesting([Grid(cascade.shape, cascade.voxel, cascade.bounds_min) for cascade in cascades], tree.brick)
 
 
-def check_nesting(grids: Sequence[tuple[tuple[int, int, int], float, np.ndarray]], brick: int) -> None:
-    """Raises ValueError unless grids of these shapes, voxel sides and corners nest as the module says."""
+def check_nesting(grids: Sequence[Grid], brick: int) -> None:
+    """Raises ValueError unless grids nest as the module says."""
     if len(grids) > MAX_CASCADES:
         raise ValueError(f"{len(grids)} cascades; expected at most {MAX_CASCADES}")
     for n in range(1, len(grids)):
-        (inner_shape, inner_voxel, inner_low), (shape, voxel, low) = grids[n - 1], grids[n]
+        shape, voxel, low = grids[n]
         if voxel != grids[0][1] * 2.0**n:
             raise ValueError(f"cascade {n} has voxels of {voxel:g}; expected {grids[0][1] * 2.0**n:g}")
-        bounds = np.stack([inner_low, inner_low + np.asarray(inner_shape) * brick * inner_voxel])
-        cells = (bounds - low) / (voxel * brick)  # (2, 3)
+        cells = (grids[n - 1].bounds(brick) - low) / (voxel * brick)  # (2, 3)
         if np.abs(cells - np.round(cells)).max() > 1e-3:
             raise ValueError(f"the box of cascade {n - 1} does not lie on faces of the coarse cells of cascade {n}")
         if (np.round(cells[0]) < 0).any() or (np.round(cells[1]) > shape).any():
@@ -124,17 +136,21 @@ def voxels_around(tree: NerfTree, points: np.ndarray) -> np.ndarray:
     for n, cascade in enumerate(cascades_of(tree)):
         here = np.flatnonzero(which == n)
         at = np.floor((points[here] - cascade.bounds_min) / cascade.voxel - 0.5).astype(np.int64)[:, None] + corner  # (n, 8, 3)
-        size = np.asarray(cascade.shape) * tree.brick
-        inside = ((at >= 0) & (at < size)).all(axis=-1)
-        at = np.clip(at, 0, size - 1)
-        cell, local = np.divmod(at, tree.brick)
-        owner = cascade.brick_index[cell[..., 0], cell[..., 1], cell[..., 2]]
-        slot = (local[..., 0] * tree.brick + local[..., 1]) * tree.brick + local[..., 2]
-        stored = inside & (owner >= 0)
-        found = np.full(stored.shape, -1, np.int32)
-        found[stored] = tree.voxel_index[owner[stored], slot[stored]]
-        out[here] = found
+        out[here] = voxels_at(tree, cascade, at)
     return out
+
+
+def voxels_at(tree: NerfTree, cascade: Cascade, at: np.ndarray) -> np.ndarray:
+    """(...,) int32: the stored voxels of a cascade at voxel coordinates (..., 3), -1 where none is."""
+    size = np.asarray(cascade.shape) * tree.brick
+    inside = ((at >= 0) & (at < size)).all(axis=-1)
+    cell, local = np.divmod(np.clip(at, 0, size - 1), tree.brick)
+    owner = cascade.brick_index[cell[..., 0], cell[..., 1], cell[..., 2]]
+    slot = (local[..., 0] * tree.brick + local[..., 1]) * tree.brick + local[..., 2]
+    stored = inside & (owner >= 0)
+    found = np.full(stored.shape, -1, np.int32)
+    found[stored] = tree.voxel_index[owner[stored], slot[stored]]
+    return found
 
 
 def cascade_tree(tree: NerfTree, number: int) -> NerfTree:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from efficientnerf.asset.cascades import cascade_tree, cascades_of, nested, subset, voxel_cascades, voxel_coordinates
+from efficientnerf.asset.cascades import cascade_tree, cascades_of, nested, subset, voxel_cascades, voxel_coordinates, voxels_at
 from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.asset.tree import NerfTree, Region, tree_from_voxels
 from efficientnerf.rendering.harmonics import harmonics_count
@@ -94,7 +94,7 @@ def _merged(tree: NerfTree, indices: np.ndarray, ratio: float, count: int) -> tu
     step = (np.arange(count) + 0.5) / count
     offset = np.stack(np.meshgrid(step, step, step, indexing="ij"), axis=-1)  # (M, M, M, 3)
     place = ((indices[:, None, None, None] + offset) * ratio).astype(np.int64)  # (n, M, M, M, 3)
-    voxel = lookup(tree, place.reshape(-1, 3)).reshape(place.shape[:-1])
+    voxel = voxels_at(tree, cascades_of(tree)[0], place)
     known: np.ndarray = np.greater_equal(voxel, 0)
     density = np.where(known, tree.density_values[np.maximum(voxel, 0)], 0).astype(np.float64)
     side = tree.voxel * ratio
@@ -118,19 +118,7 @@ def pruned(tree: NerfTree) -> NerfTree:
     member = voxel_cascades(tree) if tree.outer else np.zeros(len(lit), np.uint8)
     for n, cascade in enumerate(cascades_of(tree)):
         here = np.flatnonzero(member == n)
-        grid = replace(tree, shape=cascade.shape, brick_index=cascade.brick_index, outer=())
         for offset in np.argwhere(np.ones((3, 3, 3), bool)) - 1:
-            beside = lookup(grid, at[here] + offset)
+            beside = voxels_at(tree, cascade, at[here] + offset)
             lit[here] |= (beside >= 0) & (tree.density_values[np.maximum(beside, 0)] > 0)
     return tree if lit.all() else subset(tree, lit)
-
-
-def lookup(tree: NerfTree, at: np.ndarray) -> np.ndarray:
-    """Numbers (n,) of the stored voxels of cascade 0 at coordinates (n, 3), -1 where none is."""
-    inside: np.ndarray = ((at >= 0) & (at < np.asarray(tree.resolution))).all(axis=1)  # type: ignore[assignment]
-    cell, local = np.divmod(np.where(inside[:, None], at, 0), tree.brick)
-    owner = np.where(inside, tree.brick_index[tuple(cell.T)], -1)
-    slot = (local[:, 0] * tree.brick + local[:, 1]) * tree.brick + local[:, 2]
-    if not len(tree.voxel_index):
-        return np.full(len(at), -1, np.int32)
-    return np.where(owner >= 0, tree.voxel_index[np.maximum(owner, 0), slot], -1)

@@ -16,8 +16,8 @@ import numpy as np
 
 from efficientnerf.asset.cascades import bricks_of, cascades_of, order_of, voxel_sides
 from efficientnerf.asset.file import packed, streams
-from efficientnerf.asset.palettes import PaletteHarmonics
-from efficientnerf.asset.quantisation import ENTRIES, LIMIT, base_codes, clustered, compacted, quantised_density
+from efficientnerf.asset.palettes import MAX_HALF, PaletteHarmonics
+from efficientnerf.asset.quantisation import ENTRIES, base_codes, clustered, quantised_density
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.entropy import choices, walks
 from efficientnerf.backends.pieces import pieces
@@ -84,13 +84,6 @@ def economy_of(tree: NerfTree, weight: np.ndarray | None = None, entries: int = 
     return Economy(tree, order, voxels, found)
 
 
-def economised(tree: NerfTree, weight: np.ndarray | None = None, rate: float = DEFAULT_RATE, entries: int = ENTRIES) -> NerfTree:
-    """The tree with codes for `packed` at a rate, see `Economy.at`; arguments as of `economy_of`."""
-    if not len(tree.density_values):
-        return compacted(tree, entries)
-    return economy_of(tree, weight, entries).at(rate)
-
-
 def _voxels_of(tree: NerfTree, order: np.ndarray, weight: np.ndarray | None) -> _Voxels:
     side = voxel_sides(tree)[order] if tree.outer else np.float32(tree.voxel)
     density = tree.density_values[order]
@@ -99,7 +92,7 @@ def _voxels_of(tree: NerfTree, order: np.ndarray, weight: np.ndarray | None) -> 
     grids = [packed.padded(cascade.brick_index >= 0) for cascade in cascades_of(tree)]
     stored = (tree.voxel_index[bricks_of(tree)] >= 0).astype(np.uint8)
     neighbours, first = packed.neighbours_of(grids, stored, tree.brick)
-    return _Voxels(density, opacity, np.clip(tree.sh[order], -LIMIT, LIMIT), worth, neighbours.reshape(-1), first, side)
+    return _Voxels(density, opacity, np.clip(tree.sh[order], -MAX_HALF, MAX_HALF), worth, neighbours.reshape(-1), first, side)
 
 
 def _bits(counts: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from efficientnerf.asset.bake import Visibility, spread_pixels
+from efficientnerf.asset.cascades import Grid
 from efficientnerf.backends.numba.bricks import boxes_of_samples, greatest_around, weigh_voxels
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera
@@ -28,8 +29,6 @@ from efficientnerf.training.pixels import Pixels
 RAYS_PER_BLOCK = 8192  # that are rendered at once
 RAYS_PER_PASS = 2**15  # whose samples a kernel is given at once
 PAST_BORDERS = 0.2  # of the sides of an image. docs/experiments/whole-scene.md
-
-Grid = tuple[tuple[int, int, int], float, np.ndarray]  # coarse cells along x, y, z; side of a voxel; corner (3,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +181,7 @@ def _boxes_of(samples: FieldSamples, boxes: Sequence[np.ndarray]) -> Iterator[tu
 def cascade_visibility(samples: FieldSamples, grids: Sequence[Grid], brick: int, threshold: float) -> list[Visibility]:
     """The greatest weight of each voxel of nested grids; a sample counts in the innermost one whose box holds it, and along all of its extent: the density
     is taken to be the same throughout. Weights that do not exceed `threshold` are left out. The grids are filled by a thread each."""
-    holes = [np.zeros((2, 3)), *(np.stack([low, low + np.asarray(shape) * brick * voxel]) for shape, voxel, low in grids[:-1])]
+    holes = [np.zeros((2, 3)), *(grid.bounds(brick) for grid in grids[:-1])]
     with ThreadPoolExecutor(torch.get_num_threads()) as threads:
         return list(threads.map(lambda grid, hole: _grid_visibility(samples, grid, hole, brick, threshold), grids, holes))
 

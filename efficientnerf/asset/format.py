@@ -7,6 +7,7 @@ file states is checked against the file's size and against the other tensors bef
 import hashlib
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -177,7 +178,7 @@ def load(path: str | Path) -> NerfTree:
     header = _open(path)
     name, meta = header.name, header.meta
     layout = LAYOUTS[layout_of(meta)]
-    raw = {tensor: header.read_verified(tensor) for tensor in _tensors_of(meta)}
+    raw = {tensor: header.read(tensor) for tensor in _tensors_of(meta)}
     if layout.unpacked is not None:
         raw = layout.unpacked(name, meta, raw)
     cascades, bricks = _cascades(name, meta, raw), len(raw["brick.mask" if "brick.mask" in raw else "brick.density"])
@@ -194,6 +195,14 @@ def load(path: str | Path) -> NerfTree:
     del raw
     voxel_index = np.full(stored.shape, -1, np.int32)
     voxel_index[stored] = np.arange(count, dtype=np.int32)
+    tree = _tree_of(name, meta, cascades, voxel_index, density, harmonics)
+    return replace(tree, environment=environment, region=region)
+
+
+def _tree_of(
+    name: str, meta: dict[str, Any], cascades: list[Cascade], voxel_index: np.ndarray, density: np.ndarray, harmonics: np.ndarray | PaletteHarmonics
+) -> NerfTree:
+    """The tree of a file with these metadata, without its environment map and region."""
     background = meta["background"]
     return NerfTree(
         shape=cascades[0].shape,
@@ -210,8 +219,6 @@ def load(path: str | Path) -> NerfTree:
         lookup=lookup_of(name, meta),
         step_size=step_size_of(name, meta),
         outer=tuple(cascades[1:]),
-        environment=environment,
-        region=region,
     )
 
 
@@ -223,7 +230,7 @@ def _cascades(name: str, meta: dict[str, Any], raw: dict[str, np.ndarray]) -> li
         occupied = np.flatnonzero(whole_scene.booleans(name, whole_scene.occupancy_name(n), raw[whole_scene.occupancy_name(n)], cells, "cells"))
         brick_index = np.full(cells, -1, np.int32)
         brick_index[occupied] = np.arange(first, first + len(occupied), dtype=np.int32)
-        cascades.append(Cascade(grid.shape, grid.voxel, np.asarray(grid.bounds_min, np.float64), brick_index.reshape(grid.shape)))
+        cascades.append(Cascade(*grid, brick_index.reshape(grid.shape)))
         first += len(occupied)
     return cascades
 
@@ -250,22 +257,8 @@ def outline(path: str | Path) -> NerfTree:
     if "voxel.base" in shapes:
         tables = _sized(shapes["base.table"], "<f4"), _sized(shapes["voxel.sh"], kinds["voxel.sh"]), _sized(shapes["sh.palette"], "<f4")
         harmonics = PaletteHarmonics(_sized(shapes["voxel.base"], "u1"), *tables, tuple(meta["sh_groups"]))
-    grids = [Cascade(grid.shape, grid.voxel, np.asarray(grid.bounds_min, np.float64), _sized(grid.shape, "<i4")) for grid in whole_scene.grids_of(meta)]
-    return NerfTree(
-        shape=grids[0].shape,
-        brick=brick,
-        voxel=float(meta["voxel"]),
-        bounds_min=grids[0].bounds_min,
-        brick_index=grids[0].brick_index,
-        voxel_index=_sized((bricks, brick**3), "<i4"),
-        density_values=_sized((voxels,), "<f4"),
-        harmonics=harmonics,
-        metadata={key: value for key, value in meta.items() if key not in STRUCTURE},
-        ndc=ndc_of(name, meta),
-        lookup=lookup_of(name, meta),
-        step_size=step_size_of(name, meta),
-        outer=tuple(grids[1:]),
-    )
+    cascades = [Cascade(*grid, _sized(grid.shape, "<i4")) for grid in whole_scene.grids_of(meta)]
+    return _tree_of(name, meta, cascades, _sized((bricks, brick**3), "<i4"), _sized((voxels,), "<f4"), harmonics)
 
 
 def _sized(shape: tuple[int, ...], kind: Any) -> np.ndarray:
@@ -314,14 +307,13 @@ def _whole_scene_facts(meta: dict[str, Any]) -> dict[str, Any]:
     """What `describe` reports besides one grid: all cascades, where there are more than one or an environment map; rows and columns of the map; the region."""
     facts: dict[str, Any] = {}
     if whole_scene.is_nested(meta):
-        cascades = [Cascade(grid.shape, grid.voxel, np.asarray(grid.bounds_min), np.empty(0)) for grid in whole_scene.grids_of(meta)]
-        boxes = [cascade.bounds(int(meta["brick"])).tolist() for cascade in cascades]
-        facts["cascades"] = [
-            {"coarse_cells": list(cascade.shape), "resolution": [n * int(meta["brick"]) for n in cascade.shape], "voxel_side": cascade.voxel,
-             "bounds": {"min": low, "max": high}}
-            for cascade, (low, high) in zip(cascades, boxes, strict=True)
-        ]  # fmt: skip
-        facts["environment"] = [whole_scene.environment_rows(meta), 2 * whole_scene.environment_rows(meta)] if whole_scene.environment_rows(meta) else None
-    if whole_scene.region_of(meta, None) is not None:
+        facts["cascades"], brick = [], int(meta["brick"])
+        for grid in whole_scene.grids_of(meta):
+            low, high = grid.bounds(brick).tolist()
+            place = {"coarse_cells": list(grid.shape), "resolution": [n * brick for n in grid.shape], "voxel_side": grid.voxel}
+            facts["cascades"].append({**place, "bounds": {"min": low, "max": high}})
+        rows = whole_scene.environment_rows(meta)
+        facts["environment"] = [rows, 2 * rows] if rows else None
+    if whole_scene.states_region(meta):
         facts["region"] = meta["region"]
     return facts

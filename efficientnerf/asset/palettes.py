@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 
 BLOCK = 2**18  # voxels decoded at once
+MAX_HALF = 65000.0  # fits a half
 
 
 @dataclass(frozen=True, eq=False)

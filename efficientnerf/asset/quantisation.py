@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from efficientnerf.asset.cascades import voxel_sides
-from efficientnerf.asset.palettes import PaletteHarmonics
+from efficientnerf.asset.palettes import MAX_HALF, PaletteHarmonics
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba import kmeans
 from efficientnerf.backends.pieces import pieces
@@ -25,7 +25,6 @@ SAMPLES = 2**16
 ITERATIONS = 12
 MIN_DEPTH = 1e-3  # optical depth of a voxel below which its density is rounded to zero
 MAX_DEPTH = 50.0  # optical depth above which a voxel looks the same
-LIMIT = 65000.0  # fits a half
 
 
 def compacted(tree: NerfTree, entries: int = ENTRIES, groups: tuple[int, ...] | None = None) -> NerfTree:
@@ -71,7 +70,7 @@ def quantised_harmonics(sh: np.ndarray, opacity: np.ndarray, entries: int, group
     """
     if sum(groups) != sh.shape[1] - 1:
         raise ValueError(f"groups {groups} hold {sum(groups)} harmonics; expected {sh.shape[1] - 1}")
-    sh = np.clip(sh, -LIMIT, LIMIT)
+    sh = np.clip(sh, -MAX_HALF, MAX_HALF)
     base, table = base_codes(sh[:, 0])
     palette = np.zeros((0, sh.shape[1] - 1, 3), np.float32)
     codes = np.zeros((len(sh), len(groups)), np.uint16 if entries > ENTRIES else np.uint8)

@@ -72,8 +72,7 @@ def cropped(tree: NerfTree, corners: np.ndarray, world_from_capture: Similarity)
     low, high = np.min(corners, axis=0), np.max(corners, axis=0)
     if np.shape(corners) != (2, 3) or not np.isfinite(corners).all() or not (high > low).all():
         raise ValueError(f"box from {low.tolist()} to {high.tolist()}; expected two opposite corners of a box with some volume")
-    points = voxel_centres(tree)
-    points = points if tree.ndc is None else np.asarray(tree.ndc.world(points))
+    points = tree.frame.world(voxel_centres(tree))
     with np.errstate(invalid="ignore"):  # at infinity, in normalised device coordinates
         at = world_from_capture.inverse().points(points)
         inside = (at >= low).all(axis=1) & (at <= high).all(axis=1)

@@ -111,40 +111,28 @@ def render_rays(
     return outputs
 
 
-def _render_single_rays(tree: NerfTree, camera: Camera, background: tuple[float, float, float] | None, rays_per_band: int) -> Rendering:
-    """`_render_by_rays` of one ray to a pixel, where nothing has to be merged."""
-    height, width = camera.height, camera.width
-    colour, opacity = np.empty((height, width, 3), np.float32), np.empty((height, width), np.float32)
-    depth, normal = np.empty_like(opacity), np.empty_like(colour)
-    step = max(1, rays_per_band // 2 // width)
-    for top in range(0, height, step):
-        y, x = np.mgrid[top : min(height, top + step), 0:width]
-        origins, directions = rays(camera, np.stack([x.ravel(), y.ravel()], axis=-1) + 0.5)
-        part = render_rays(tree, origins, directions, eye=camera.centre, columns=width, background=background)
-        to, hit = slice(top, top + len(y)), part.opacity >= 0.5
-        depth[to] = np.where(hit, part.depth * (directions @ camera.forward), np.inf).reshape(y.shape)
-        normal[to] = (part.normal * hit[:, None]).reshape(*y.shape, 3)
-        opacity[to] = part.opacity.reshape(y.shape)
-        colour[to] = part.colour.reshape(*y.shape, 3)
-    return Rendering(colour, opacity, depth, normal)
-
-
 def _render_by_rays(tree: NerfTree, camera: Camera, background: tuple[float, float, float] | None, supersample: int, rays_per_band: int) -> Rendering:
     """An image band by band of `render_rays`: of a tree that is not interpolated, or on a device of one whose frame is not the world, where rays diverge."""
     height, width, n = camera.height, camera.width, supersample
-    if n == 1:
-        return _render_single_rays(tree, camera, background, rays_per_band)
-    bands, behind = [], np.zeros(3, np.float32) if background is None else np.asarray(background, np.float32)
+    out = Rendering(*(np.empty((height, width, *channels), np.float32) for channels in ((3,), (), (), (3,))))
+    behind = np.zeros(3, np.float32) if background is None else np.asarray(background, np.float32)
     step = max(1, rays_per_band // 2 // (width * n**2))
     for top in range(0, height, step):
         y, x = np.mgrid[top * n : min(height, top + step) * n, 0 : width * n]
         origins, directions = rays(camera, (np.stack([x.ravel(), y.ravel()], axis=-1) + 0.5) / n)
-        part = render_rays(tree, origins, directions, eye=camera.centre, columns=width * n, background=None if background is None else (0, 0, 0))
+        before = background if n == 1 or background is None else (0, 0, 0)
+        part = render_rays(tree, origins, directions, eye=camera.centre, columns=width * n, background=before)
         along = (part.depth * (directions @ camera.forward)).astype(np.float32)
-        values = np.concatenate([part.colour, part.opacity[:, None], along[:, None], part.normal], axis=1, dtype=np.float32)
         rows = len(y) // n
-        bands.append(_merged(values.reshape(rows, n, width, n, 8).swapaxes(1, 2).reshape(rows, width, n * n, 8), behind))
-    return Rendering(*(np.concatenate(parts) for parts in zip(*bands, strict=True)))
+        if n == 1:
+            hit = part.opacity >= 0.5
+            band = part.colour, part.opacity, np.where(hit, along, np.float32(np.inf)), part.normal * hit[:, None]
+        else:
+            values = np.concatenate([part.colour, part.opacity[:, None], along[:, None], part.normal], axis=1, dtype=np.float32)
+            band = _merged(values.reshape(rows, n, width, n, 8).swapaxes(1, 2).reshape(rows, width, n * n, 8), behind)
+        for whole, piece in zip(vars(out).values(), band, strict=True):
+            whole[top : top + rows] = piece.reshape(rows, width, *whole.shape[2:])
+    return out
 
 
 def _merged(samples: np.ndarray, behind: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.asset.palettes import PaletteHarmonics
-from efficientnerf.backends.numba.tree.leaps import leaps as distances
+from efficientnerf.backends.numba.tree.leaps import leaps
 from efficientnerf.geometry.ndc import WORLD, Frame, Ndc
 from efficientnerf.rendering.harmonics import harmonics_count
 
@@ -42,6 +42,11 @@ class Cascade:
     def bounds(self, brick: int) -> np.ndarray:
         """(2, 3) corners, for so many voxels along a coarse cell."""
         return np.stack([self.bounds_min, self.bounds_min + np.asarray(self.shape) * brick * self.voxel])
+
+    @property
+    def leap(self) -> np.ndarray:
+        """As `NerfTree.leap`."""
+        return leaps(self.brick_index >= 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,11 +161,6 @@ class NerfTree:
 
     def with_metadata(self, **entries: Any) -> NerfTree:
         return replace(self, metadata={**self.metadata, **entries})
-
-
-def leaps(occupied: np.ndarray) -> np.ndarray:
-    """`NerfTree.leap` of coarse cells (X, Y, Z) bool."""
-    return distances(occupied)
 
 
 def tree_from_voxels(

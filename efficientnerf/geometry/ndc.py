@@ -166,6 +166,9 @@ class WorldFrame:
     def points(self, world: Any) -> Any:
         return world
 
+    def world(self, points: Any) -> Any:
+        return points
+
     def rays(self, origins: Any, directions: Any) -> NdcRays:
         zero = origins[..., 0] * 0
         return NdcRays(origins, directions, zero, zero + 1, zero)

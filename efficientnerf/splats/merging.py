@@ -24,6 +24,7 @@ from efficientnerf.backends.numba.tree.cells import cells_of as tree_cells
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.geometry.directions import across
+from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.rendering import environment
 from efficientnerf.rendering.colour import sigmoid
 from efficientnerf.rendering.harmonics import C0, basis_numpy
@@ -96,21 +97,18 @@ def _pixel_widths(tree: NerfTree, cameras: Sequence[Camera], centres: np.ndarray
     """(N,) of voxels in pixels: the root mean square over views, wherever they look."""
     chosen = [cameras[int(n)] for n in np.unique(np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).round())]
     square, side = np.zeros(len(centres)), sides
-    world = centres
     if tree.ndc is not None:
-        world, side = tree.ndc.world(centres), sides * np.linalg.norm(_jacobians(tree, centres)[:, :, 0], axis=1)
-    columns, area = np.ascontiguousarray(world.T), side**2
+        side = sides * np.linalg.norm(_jacobians(tree.ndc, centres)[:, :, 0], axis=1)
+    columns, area = np.ascontiguousarray(tree.frame.world(centres).T), side**2
     for camera in chosen:
         k, (x, y, z) = camera.intrinsics, columns - camera.centre[:, None]
         square += k["fx"] * k["fy"] * area / np.maximum(x * x + y * y + z * z, area)
     return np.sqrt(square / len(chosen))
 
 
-def _jacobians(tree: NerfTree, points: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) derivative of the world by the frame at points (N, 3) of the frame."""
-    if tree.ndc is None:
-        return np.broadcast_to(np.eye(3), (len(points), 3, 3))
-    ndc, (a, b) = tree.ndc, tree.ndc.slopes
+def _jacobians(ndc: Ndc, points: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) derivative of the world by normalised device coordinates at points (N, 3) there."""
+    a, b = ndc.slopes
     z = 2 * ndc.near / np.maximum(1 - points[:, 2], 1e-9)
     local = np.zeros((len(points), 3, 3))
     local[:, 0, 0], local[:, 1, 1] = z / a, z / b
@@ -189,7 +187,7 @@ def _gaussians_of_cells(tree: NerfTree, shown: Shown, begin: np.ndarray, degree:
     thickness = THICKER * np.add.reduceat(tree.density_values[shown.voxels] * shown.sides**3, first) / (2 * np.pi * scales[:, 0] * scales[:, 1])
     opacities = np.clip(-np.expm1(-thickness), 0.02, 0.98)
     if tree.ndc is not None:
-        mean, axes, scales = _in_the_world(tree, mean, axes, scales)
+        mean, axes, scales = _in_the_world(tree.ndc, mean, axes, scales)
     harmonics = np.empty((len(mean), (degree + 1) ** 2, 3), np.float32)
     _convert(tree, shown, begin, weight, harmonics, degree)
     parts = mean, scales, quaternions_from(axes), opacities, harmonics
@@ -218,14 +216,13 @@ def flattened(spread: np.ndarray, normals: np.ndarray, side: np.ndarray) -> tupl
     return np.stack([first, second, normal], axis=-1), np.stack([*widths, deep], axis=-1)
 
 
-def _in_the_world(tree: NerfTree, mean: np.ndarray, axes: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _in_the_world(ndc: Ndc, mean: np.ndarray, axes: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Gaussians of normalised device coordinates in the world: means, axes and standard deviations."""
-    assert tree.ndc is not None
-    root = np.einsum("nij,njk->nik", _jacobians(tree, mean), axes * scales[:, None, :])
+    root = np.einsum("nij,njk->nik", _jacobians(ndc, mean), axes * scales[:, None, :])
     variance, turned = np.linalg.eigh(np.einsum("nij,nkj->nik", root, root))
     turned[:, :, 0] *= np.sign(np.linalg.det(turned))[:, None]
-    world = tree.ndc.world(mean)
-    far = np.linalg.norm(world - tree.ndc.world_from_camera[:3, 3], axis=1, keepdims=True)
+    world = ndc.world(mean)
+    far = np.linalg.norm(world - ndc.world_from_camera[:3, 3], axis=1, keepdims=True)
     scales = np.sqrt(np.maximum(variance, (1e-6 * far) ** 2))  # ascending
     scales[:, 2] = np.minimum(scales[:, 2], DEEPEST * scales[:, 1])
     return world, turned, scales

@@ -69,7 +69,7 @@ def surface(
 
     Raises NoSurface.
     """
-    seen = None if shown is None else (lambda places, triangles, component: shown(volume.world(places), triangles, component))
+    seen = None if shown is None else (lambda places, triangles, component: shown(volume.tree.frame.world(places), triangles, component))
     inside = volume.inner(viewpoints)
     vertices, triangles, facts = cleaned_surface(volume, threshold, min_component, rounds, inside, progress, seen, fusion)
     facts["faces_before_decimation"] = len(triangles)

@@ -84,10 +84,6 @@ class Volume:
         neither a highlight nor a direction without training views decides."""
         return outside_directions(normals)
 
-    def world(self, points: np.ndarray) -> np.ndarray:
-        """Points (N, 3) of the frame in the world."""
-        return points
-
     def in_world(self, mesh: Mesh) -> Mesh:
         """A mesh of the frame in the world."""
         return mesh
@@ -127,9 +123,6 @@ class NdcVolume(Volume):
         centres = places @ self.ndc.world_from_camera[:3, :3].T + self.ndc.world_from_camera[:3, 3]
         away = [self.ndc.world(np.asarray(points, np.float64)) - centre for centre in centres]
         return [each / np.maximum(np.linalg.norm(each, axis=1, keepdims=True), 1e-12) for each in away]
-
-    def world(self, points: np.ndarray) -> np.ndarray:
-        return np.asarray(self.ndc.world(points))
 
     def in_world(self, mesh: Mesh) -> Mesh:
         """The map keeps the handedness, so that faces stay outside out."""

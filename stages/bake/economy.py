@@ -9,8 +9,8 @@ import math
 
 from efficientnerf.asset import economy
 from efficientnerf.asset.cascades import subset
-from efficientnerf.asset.economy import economised
 from efficientnerf.asset.format import serialize
+from efficientnerf.asset.quantisation import compacted
 from efficientnerf.asset.refinement import fit
 from efficientnerf.asset.refinement.quantised import refit
 from efficientnerf.asset.refinement.targets import Targets
@@ -37,7 +37,7 @@ def packed_tree(job: Job, tree: NerfTree, targets: Targets, size: int) -> tuple[
     targets  what voxels are weighed by, and tables are fitted to
     """
     settings = job.settings
-    coded = _coded(job, tree, targets, size) if len(tree.density_values) else economised(tree)
+    coded = _coded(job, tree, targets, size) if len(tree.density_values) else compacted(tree)
     targets = targets_on_device(job, coded, targets)
     found = refit(
         coded, targets, REFIT_STEPS, rounds=REFIT_ROUNDS, rays=settings.refine_rays_per_batch, seed=settings.seed, safe_point=job.safe_point,

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from efficientnerf.asset.bake import grid_of
-from efficientnerf.asset.cascades import cascade_grids
-from efficientnerf.asset.field_samples import Grid
+from efficientnerf.asset.cascades import Grid, cascade_grids
 from efficientnerf.asset.file import serialisation
 from efficientnerf.geometry.spaces import NdcSpace, Space
 from efficientnerf.model import Model
@@ -198,7 +197,7 @@ def unused_settings(settings: BakeSettings, m: Model, plan: Bake) -> Iterator[st
 def grid_over(space: Space, resolution: int, brick: int) -> Grid:
     """The grid over a space's box, with so many voxels along its longest side."""
     shape, voxel = grid_of(space.bounds, resolution, brick)
-    return shape, voxel, np.asarray(space.bounds[0], np.float64)
+    return Grid(shape, voxel, np.asarray(space.bounds[0], np.float64))
 
 
 def nested_grids(bounds: np.ndarray, resolution: int, brick: int, count: int, lattice: np.ndarray | None) -> list[Grid]:
@@ -211,4 +210,4 @@ def nested_grids(bounds: np.ndarray, resolution: int, brick: int, count: int, la
         return cascade_grids(bounds, voxel, brick, count)
     grids = cascade_grids(np.stack([bounds[0] - voxel / 2, bounds[1] + voxel / 2]), voxel, brick, count)
     offset = (grids[0][2] - lattice) / voxel
-    return [(shape, side, low + (np.round(offset) - offset) * voxel) for shape, side, low in grids]
+    return [grid._replace(bounds_min=grid.bounds_min + (np.round(offset) - offset) * voxel) for grid in grids]

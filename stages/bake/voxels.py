@@ -10,7 +10,7 @@ import numpy as np
 
 from efficientnerf.asset import bake
 from efficientnerf.asset.bake import Visibility
-from efficientnerf.asset.field_samples import Grid
+from efficientnerf.asset.cascades import Grid
 from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import Model

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from efficientnerf.asset.bake import Visibility, chosen_voxels
+from efficientnerf.asset.cascades import Grid
 from efficientnerf.asset.field_samples import (
     FieldSamples,
-    Grid,
     cascade_visibility,
     environment_beyond,
     field_samples,

@@ -90,7 +90,7 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "a similarity of text": (lambda: meta_with(world_from_capture="identity"), "'world_from_capture' is identity; expected an object"),
     "a similarity without scale": (lambda: meta_with(world_from_capture={}), "'scale' is None"),
     "a scale of zero": (lambda: rotated(scale=0), "'scale' is 0"),
-    "a rotation of two rows": (lambda: rotated(rotation=[[1, 0, 0], [0, 1, 0]]), "expected three rows"),
+    "a rotation of two rows": (lambda: rotated(rotation=[[1, 0, 0], [0, 1, 0]]), "expected 3 rows"),
     "a rotation of short rows": (lambda: rotated(rotation=[[1, 0], [0, 1, 0], [0, 0, 1]]), "expected 3 numbers"),
     "a reflection": (lambda: rotated(rotation=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]), "is not a rotation"),
     "a shear": (lambda: rotated(rotation=[[1, 0.1, 0], [0, 1, 0], [0, 0, 1]]), "is not a rotation"),
@@ -151,7 +151,7 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "no reference camera": (lambda: meta_with(layout="ndc-sparse"), "'ndc' is None; expected an object"),
     "a reference camera of text": (lambda: meta_with(layout="ndc-sparse", ndc="pinhole"), "'ndc' is pinhole; expected an object"),
     "a reference camera without focal length": (lambda: reference(focal=0), "'focal' is 0"),
-    "a reference camera of three rows": (lambda: reference(world_from_camera=[[1, 0, 0, 0]] * 3), "expected four rows"),
+    "a reference camera of three rows": (lambda: reference(world_from_camera=[[1, 0, 0, 0]] * 3), "expected 4 rows"),
     "a reference camera of short rows": (lambda: reference(world_from_camera=[[1, 0, 0]] * 4), "expected 4 numbers"),
     "a reference camera that shears": (lambda: reference(world_from_camera=[[1, 1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "'ndc': "),
     # nearest lookup

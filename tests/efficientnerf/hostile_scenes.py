@@ -57,8 +57,8 @@ SCENES: dict[str, tuple[Callable[[], bytes], str]] = {
     # region
     "a region of text": (lambda: meta_with(NESTED[0], region="front"), "'region' is front; expected an object"),
     "a region that is null": (lambda: meta_with(format_version="1.4", region=None), "'region' is None; expected an object"),
-    "a region without bounds": (lambda: region(bounds="absent"), "'bounds' is None; expected two corners"),
-    "a region of one corner": (lambda: region(bounds=[[0, 0, 0]]), "expected two corners"),
+    "a region without bounds": (lambda: region(bounds="absent"), "'bounds' is None; expected 2 rows"),
+    "a region of one corner": (lambda: region(bounds=[[0, 0, 0]]), "expected 2 rows"),
     "a region of short corners": (lambda: region(bounds=[[0, 0], [1, 1]]), "expected 3 numbers"),
     "a region from its greatest corner": (lambda: region(bounds=[[0, 0, 0], [1, -1, 1]]), "expected the least corner, then the greatest"),
     "a region without height": (lambda: region(bounds=[[0, 0, 0], [1, 1, 0]]), "expected the least corner, then the greatest"),

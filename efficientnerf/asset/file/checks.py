@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import numpy as np
+
 from efficientnerf.asset.file.container import FormatError
 
 FARTHEST = 2.0**40  # in units of the grid: 64-bit floats tell places to a thousandth of one there
@@ -19,6 +21,20 @@ def numbers(name: str, meta: dict[str, Any], key: str, count: int, low: float, h
     value = meta.get(key)
     if not (isinstance(value, list) and len(value) == count and all(type(x) in (int, float) and low <= x <= high for x in value)):
         raise FormatError(f"{name}: metadata '{key}' is {str(value)[:60]}; expected {count} numbers from {low:g} to {high:g}")
+    return value
+
+
+def matrix(name: str, meta: dict[str, Any], key: str, rows: int, columns: int, low: float, high: float) -> np.ndarray:
+    value = meta.get(key)
+    if not (isinstance(value, list) and len(value) == rows):
+        raise FormatError(f"{name}: metadata '{key}' is {str(value)[:60]}; expected {rows} rows")
+    return np.array([numbers(name, {key: row}, key, columns, low, high) for row in value], np.float64)
+
+
+def flag(name: str, meta: dict[str, Any], key: str) -> bool:
+    value = meta.get(key)
+    if type(value) is not bool:
+        raise FormatError(f"{name}: metadata '{key}' is {str(value)[:60]}; expected true or false")
     return value
 
 

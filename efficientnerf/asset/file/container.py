@@ -145,19 +145,15 @@ class Header:
             raise FormatError(f"{self.name}: {self.size - self.start - at} bytes after the last tensor; the file was appended to.")
 
     def read(self, name: str) -> np.ndarray:
+        """The tensor, if its bytes have the digest in the metadata."""
         dtype, shape, begin, _ = self.tensors[name]
         with open(self.path, "rb", opener=_regular) as file:
             values = np.fromfile(file, DTYPES[dtype], count=math.prod(shape), offset=self.start + begin)
         if len(values) != math.prod(shape):
             raise FormatError(f"{self.name}: tensor '{name}' could not be read whole; the file changed while it was read")
-        return values.reshape(shape)
-
-    def read_verified(self, name: str) -> np.ndarray:
-        """The tensor, if its bytes have the digest in the metadata."""
-        values, digests = self.read(name), self.meta.get("sha256")
+        digests, found = self.meta.get("sha256"), _digest(values)
         want = digests.get(name) if isinstance(digests, dict) else None
-        found = _digest(values)
         if found != want:
             problem = f"has SHA-256 {found[:12]}…, the file says {str(want)[:12]}…"
             raise FormatError(f"{self.name}: tensor '{name}' {problem}; the file is damaged. Bake it again or copy it anew.")
-        return values
+        return values.reshape(shape)

@@ -20,7 +20,6 @@ from efficientnerf.asset.file.container import FormatError
 from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.rendering.harmonics import harmonics_count
 
-LIMIT = 65000.0  # fits a half
 Shape = tuple[int, ...]
 Tensors = dict[str, np.ndarray]
 
@@ -83,7 +82,7 @@ def _sound(name: str, density: np.ndarray, *coefficients: np.ndarray) -> None:
 
 
 def _sparse_shapes(name: str, meta: dict[str, Any], found: dict[str, Shape]) -> dict[str, Shape]:
-    count = found["voxel.density"][0] if len(found["voxel.density"]) == 1 else -1
+    count = _first(found["voxel.density"])
     return {"brick.mask": _mask_shape(meta, found), "voxel.density": (count,), "voxel.sh": (count, _harmonics_of(meta), 3)}
 
 
@@ -105,7 +104,7 @@ def _groups_of(name: str, meta: dict[str, Any]) -> tuple[int, ...]:
 
 
 def _compact_shapes(name: str, meta: dict[str, Any], found: dict[str, Shape]) -> dict[str, Shape]:
-    count = found["voxel.density"][0] if len(found["voxel.density"]) == 1 else -1
+    count = _first(found["voxel.density"])
     groups = _groups_of(name, meta)
     codes = {"brick.mask": _mask_shape(meta, found), "voxel.density": (count,), "voxel.base": (count, 3), "voxel.sh": (count, len(groups))}
     return codes | _table_shapes(name, meta, found)

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.asset.file.checks import FARTHEST, coarse_shape, number, numbers
+from efficientnerf.asset.file.checks import FARTHEST, coarse_shape, flag, matrix, number, numbers
 from efficientnerf.asset.file.container import FormatError
 from efficientnerf.asset.file.whole_scene import MINOR, NEAREST_PREFIX, NESTED_PREFIX, check_whole_scene
 from efficientnerf.asset.tree import MAX_STEP, MIN_STEP, STEP_SIZE
@@ -28,16 +28,13 @@ def _check_frame(name: str, meta: dict[str, Any], unit: float) -> None:
     for key in ("world_from_capture", "orbit"):
         if not isinstance(meta.get(key, {}), dict):
             raise FormatError(f"{name}: metadata '{key}' is {str(meta[key])[:60]}; expected an object")
-    if type(meta.get("metric", False)) is not bool:
-        raise FormatError(f"{name}: metadata 'metric' is {str(meta['metric'])[:60]}; expected true or false")
+    if "metric" in meta:
+        flag(name, meta, "metric")
     if "world_from_capture" in meta:
         similarity = meta["world_from_capture"]
         number(name, similarity, "scale", 1e-30, 1e30, whole=False)
         numbers(name, similarity, "translation", 3, -1e30, 1e30)
-        rows = similarity.get("rotation")
-        if not (isinstance(rows, list) and len(rows) == 3):
-            raise FormatError(f"{name}: metadata 'rotation' is {str(rows)[:60]}; expected three rows")
-        rotation = np.array([numbers(name, {"rotation": row}, "rotation", 3, -2, 2) for row in rows], np.float64)
+        rotation = matrix(name, similarity, "rotation", 3, 3, -2, 2)
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
             raise FormatError(f"{name}: metadata 'rotation' is not a rotation")
     if "orbit" in meta:
@@ -46,8 +43,7 @@ def _check_frame(name: str, meta: dict[str, Any], unit: float) -> None:
         number(name, orbit, "radius", 1e-30, far, whole=False)
         number(name, orbit, "elevation", -90, 90, whole=False)
         number(name, orbit, "heading", -360, 360, whole=False)
-        if type(orbit.get("forward_facing")) is not bool:
-            raise FormatError(f"{name}: metadata 'forward_facing' is {str(orbit.get('forward_facing'))[:60]}; expected true or false")
+        flag(name, orbit, "forward_facing")
 
 
 def layout_of(meta: dict[str, Any]) -> str:
@@ -85,11 +81,7 @@ def ndc_of(name: str, meta: dict[str, Any]) -> Ndc | None:
         raise FormatError(f"{name}: metadata 'ndc' is {str(found)[:60]}; expected an object")
     for key in NUMBERS:
         number(name, found, key, 1e-30, 1e30, whole=False)
-    rows = found.get("world_from_camera")
-    if not (isinstance(rows, list) and len(rows) == 4):
-        raise FormatError(f"{name}: metadata 'world_from_camera' is {str(rows)[:60]}; expected four rows")
-    for row in rows:
-        numbers(name, {"world_from_camera": row}, "world_from_camera", 4, -1e30, 1e30)
+    matrix(name, found, "world_from_camera", 4, 4, -1e30, 1e30)
     try:
         ndc = Ndc.from_json(found)
     except ValueError as error:

@@ -119,7 +119,7 @@ def _walk_all(meta: dict[str, Any], grids: list[np.ndarray], stored: np.ndarray,
 
     def occupancy(coder: Any) -> None:
         for cells in grids:
-            for piece in _pieces(cells.shape[0] - 1, 1):
+            for piece in pieces(cells.shape[0] - 1, first=1):
                 walks.walk_cells(coder, cells, piece.start, piece.stop)
 
     bit_family = [Family(walks.BIT_CONTEXTS, symbols=2)]
@@ -131,7 +131,7 @@ def _walk_all(meta: dict[str, Any], grids: list[np.ndarray], stored: np.ndarray,
     border, inner = _borders(b)
 
     def masks(coder: Any) -> None:
-        for piece in _pieces(min(each, bricks), 64):
+        for piece in pieces(min(each, bricks), first=64):
             walks.walk_masks(coder, stored, before, border, inner, b, first, piece.start, piece.stop)
 
     run(STREAMS[1], (cube * np.diff(first)).tolist(), bit_family, masks)
@@ -164,7 +164,7 @@ def _voxels_before(stored: np.ndarray) -> np.ndarray:
 def _neighbours(before: np.ndarray, stored: np.ndarray, b: int) -> np.ndarray:
     neighbours = np.full((int(np.count_nonzero(stored)), 3), -1, np.int32)
     index = np.where(stored, np.cumsum(stored, dtype=np.int32).reshape(stored.shape) - 1, -1).astype(np.int32)
-    for piece in _pieces(len(stored)):
+    for piece in pieces(len(stored), first=1024):
         walks.find_neighbours(index, before, b, neighbours, piece.start, piece.stop)
     return neighbours
 
@@ -180,22 +180,22 @@ def _walk_codes(codes: Tensors, tables: Tensors, neighbours: np.ndarray, first: 
     entries = {key: len(tables[key]) for key in TABLES}
     voxels = np.diff(first)
 
-    def pieces() -> Iterator[slice]:
-        return _pieces(int(voxels.max()))
+    def parts() -> Iterator[slice]:
+        return pieces(int(voxels.max()), first=1024)
 
     def densities(coder: Any) -> None:
-        for piece in pieces():
+        for piece in parts():
             walks.walk_densities(coder, density, near, entries["density.table"], first, piece.start, piece.stop)
 
     def bases(coder: Any) -> None:
-        for piece in pieces():
+        for piece in parts():
             walks.walk_bases(coder, base, near, entries["base.table"], first, piece.start, piece.stop)
 
     shift = 8 if sh.dtype.itemsize == 2 else 0
     quarters = quarters_of(entries["density.table"])
 
     def harmonics(coder: Any) -> None:
-        for piece in pieces() if groups else ():
+        for piece in parts() if groups else ():
             walks.walk_codes(coder, sh, near, density, quarters, shift, first, piece.start, piece.stop)
 
     run(STREAMS[2], voxels.tolist(), [Family(walks.DENSITY_CONTEXTS)], densities)
@@ -241,7 +241,3 @@ def _borders(b: int) -> tuple[np.ndarray, np.ndarray]:
     place, slot = at @ np.array([(b + 1) ** 2, b + 1, 1]), (at - 1) % b @ np.array([b * b, b, 1])
     beside = np.stack([place, back, slot], axis=1)[back > 0]
     return np.ascontiguousarray(beside, np.int32), np.ascontiguousarray(place[back == 0], np.int32)
-
-
-def _pieces(count: int, first: int = 1024) -> Iterator[slice]:
-    return pieces(count, first=first)

@@ -18,8 +18,7 @@ import numpy as np
 
 from efficientnerf.asset.cascades import bricks_of, order_of, voxel_sides
 from efficientnerf.asset.file.container import FormatError
-from efficientnerf.asset.file.layouts import LIMIT
-from efficientnerf.asset.palettes import PaletteHarmonics
+from efficientnerf.asset.palettes import MAX_HALF, PaletteHarmonics
 from efficientnerf.asset.quantisation import compacted, quantised_density
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.rendering.harmonics import harmonics_count
@@ -95,8 +94,8 @@ def _finite(what: str, values: np.ndarray) -> np.ndarray:
 
 def _sparse(tree: NerfTree) -> Written:
     order = order_of(tree)
-    density = np.minimum(_densities(tree, order), LIMIT).astype("<f2")
-    sh = np.clip(_finite("sh", tree.sh[order]), -LIMIT, LIMIT).astype("<f2")
+    density = np.minimum(_densities(tree, order), MAX_HALF).astype("<f2")
+    sh = np.clip(_finite("sh", tree.sh[order]), -MAX_HALF, MAX_HALF).astype("<f2")
     return Written("sparse", {"brick.mask": _mask(tree), "voxel.density": density, "voxel.sh": sh})
 
 
@@ -113,7 +112,7 @@ def _coded(tree: NerfTree) -> Written:
         "voxel.base": codes.base,
         "base.table": _finite("sh", codes.base_table).astype("<f4"),
         "voxel.sh": codes.codes.astype("<u2" if len(codes.palette) > 256 else "<u1"),
-        "sh.palette": np.clip(_finite("sh", codes.palette), -LIMIT, LIMIT).astype("<f2"),
+        "sh.palette": np.clip(_finite("sh", codes.palette), -MAX_HALF, MAX_HALF).astype("<f2"),
     }
     return Written("compact", tensors, {"sh_groups": list(codes.groups)})
 
@@ -149,7 +148,7 @@ def _full(tree: NerfTree, dtype: str = "<f2") -> Written:
     index, voxels, harmonics = _bricks(tree), tree.brick**3, tree.harmonics_count
     _checked(tree)
     stored = index >= 0
-    limit = LIMIT if dtype == "<f2" else np.inf
+    limit = MAX_HALF if dtype == "<f2" else np.inf
     density = np.minimum(np.where(stored, tree.density_values[index] if len(tree.density_values) else 0, 0), limit).astype(dtype)
     sh = np.zeros((len(index), voxels, harmonics, 3), dtype)
     line = np.subtract.outer(np.arange(tree.brick, dtype=np.int32), np.arange(tree.brick, dtype=np.int32)) ** 2

@@ -4,12 +4,12 @@ B bricks, H rows of the environment map.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from efficientnerf.asset.cascades import MAX_CASCADES, check_nesting
-from efficientnerf.asset.file.checks import FARTHEST, MAX_CELLS, coarse_shape, number, numbers
+from efficientnerf.asset.cascades import MAX_CASCADES, Grid, check_nesting
+from efficientnerf.asset.file.checks import FARTHEST, MAX_CELLS, coarse_shape, flag, matrix, number, numbers
 from efficientnerf.asset.file.container import FormatError
 from efficientnerf.asset.tree import Region
 
@@ -18,14 +18,6 @@ NESTED_PREFIX = "nested-"  # of layouts with several grids, or with an environme
 MINOR = 4  # the version that brought them, and regions
 MAX_ENVIRONMENT = 2048  # rows of an environment map
 OCCUPANCY, ENVIRONMENT, REGION = "coarse.occupancy", "environment", "x.region.bricks"  # tensors
-
-
-class Grid(NamedTuple):
-    """One grid as the metadata states it."""
-
-    shape: tuple[int, int, int]
-    voxel: float
-    bounds_min: tuple[float, float, float]
 
 
 def is_nested(meta: dict[str, Any]) -> bool:
@@ -37,8 +29,8 @@ def grids_of(meta: dict[str, Any]) -> list[Grid]:
     entries = [meta, *(meta["cascades"] if is_nested(meta) else [])]
     grids = []
     for n, entry in enumerate(entries):
-        (x, y, z), (a, b, c) = (int(cells) for cells in entry["shape"]), (float(place) for place in entry["bounds_min"])
-        grids.append(Grid((x, y, z), float(meta["voxel"]) * 2.0**n, (a, b, c)))
+        x, y, z = (int(cells) for cells in entry["shape"])
+        grids.append(Grid((x, y, z), float(meta["voxel"]) * 2.0**n, np.array(entry["bounds_min"], np.float64)))
     return grids
 
 
@@ -51,23 +43,22 @@ def environment_rows(meta: dict[str, Any]) -> int:
     return int(meta["environment"] or 0) if is_nested(meta) else 0
 
 
-def _region_entry(meta: dict[str, Any]) -> Any:
-    """What the file says of a region; the key means nothing below 1.4."""
-    return meta.get("region") if int(str(meta["format_version"]).split(".")[1]) >= MINOR else None
+def states_region(meta: dict[str, Any]) -> bool:
+    """Whether the file has a region; the key means nothing below 1.4."""
+    return "region" in meta and int(str(meta["format_version"]).split(".")[1]) >= MINOR
 
 
 def region_of(meta: dict[str, Any], bricks: np.ndarray | None) -> Region | None:
     """The region of a file whose metadata are checked, with its bricks (B,) bool."""
-    found = _region_entry(meta)
-    if found is None:
+    if not states_region(meta):
         return None
+    found = meta["region"]
     return Region(np.asarray(found["bounds"], np.float64), float(found["corner_radius"]), float(found["fade"]), bricks if found["bricks"] else None)
 
 
 def names_bricks(meta: dict[str, Any]) -> bool:
     """Whether the file's region is of some bricks alone."""
-    found = _region_entry(meta)
-    return found is not None and bool(found["bricks"])
+    return states_region(meta) and bool(meta["region"]["bricks"])
 
 
 def check_whole_scene(name: str, meta: dict[str, Any]) -> None:
@@ -78,9 +69,8 @@ def check_whole_scene(name: str, meta: dict[str, Any]) -> None:
             raise FormatError(f"{name}: metadata 'environment' is missing; expected the rows of the map or null")
         if meta["environment"] is not None:
             number(name, meta, "environment", 1, MAX_ENVIRONMENT, whole=True)
-    found = _region_entry(meta)
-    if found is not None or ("region" in meta and int(str(meta["format_version"]).split(".")[1]) >= MINOR):
-        _check_region(name, found, float(meta["voxel"]))
+    if states_region(meta):
+        _check_region(name, meta["region"], float(meta["voxel"]))
 
 
 def _check_cascades(name: str, meta: dict[str, Any]) -> None:
@@ -96,9 +86,8 @@ def _check_cascades(name: str, meta: dict[str, Any]) -> None:
             raise FormatError(f"{error} (cascade {n})") from None
     if cells > MAX_CELLS:
         raise FormatError(f"{name}: cascades of {cells} coarse cells; expected at most {MAX_CELLS} in all")
-    grids = grids_of(meta)
     try:
-        check_nesting([(grid.shape, grid.voxel, np.asarray(grid.bounds_min)) for grid in grids], int(meta["brick"]))
+        check_nesting(grids_of(meta), int(meta["brick"]))
     except ValueError as error:
         raise FormatError(f"{name}: metadata 'cascades': {error}") from None
 
@@ -106,16 +95,13 @@ def _check_cascades(name: str, meta: dict[str, Any]) -> None:
 def _check_region(name: str, found: Any, unit: float) -> None:
     if not isinstance(found, dict):
         raise FormatError(f"{name}: metadata 'region' is {str(found)[:60]}; expected an object")
-    far, corners = FARTHEST * unit, found.get("bounds")
-    if not (isinstance(corners, list) and len(corners) == 2):
-        raise FormatError(f"{name}: metadata 'region': 'bounds' is {str(corners)[:60]}; expected two corners")
-    low, high = (numbers(name, {"region' 'bounds": corner}, "region' 'bounds", 3, -far, far) for corner in corners)
-    if not all(a < b for a, b in zip(low, high, strict=True)):
-        raise FormatError(f"{name}: metadata 'region': 'bounds' are {str(corners)[:60]}; expected the least corner, then the greatest")
+    far = FARTHEST * unit
+    low, high = matrix(name, found, "bounds", 2, 3, -far, far)
+    if not (low < high).all():
+        raise FormatError(f"{name}: metadata 'region': 'bounds' are {str(found['bounds'])[:60]}; expected the least corner, then the greatest")
     for key in ("corner_radius", "fade"):
         number(name, found, key, 0, far, whole=False)
-    if type(found.get("bricks")) is not bool:
-        raise FormatError(f"{name}: metadata 'region': 'bricks' is {str(found.get('bricks'))[:60]}; expected true or false")
+    flag(name, found, "bricks")
 
 
 def bits(values: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from efficientnerf.asset.palettes import PaletteHarmonics
+from efficientnerf.asset.palettes import MAX_HALF, PaletteHarmonics
 from efficientnerf.asset.refinement import fit
 from efficientnerf.asset.refinement.state import RefinementState, initial_state
 from efficientnerf.asset.refinement.targets import Targets
@@ -19,14 +19,13 @@ from efficientnerf.asset.tree import NerfTree
 
 ERROR_RAYS = 2**16  # pixels that a move is judged by
 FACTORS = (2.0, 1.0, 0.5, 0.25)  # of the mean move, tried in this order
-MAX_HALF = 65000.0
 
 
 def refit(
     tree: NerfTree, targets: Targets, steps: int, *, rounds: int = 2, rays: int = 32768, density_lr: float = 0.1, sh_lr: float = 0.01, seed: int = 0,
     safe_point: Callable[[], None] | None = None,
 ) -> NerfTree:  # fmt: skip
-    """A tree of codes, as `compacted` or `economised` make it, with better tables; never one of a greater error over a sample of the training pixels.
+    """A tree of codes, as `compacted` or `Economy.at` make it, with better tables; never one of a greater error over a sample of the training pixels.
 
     steps       in all, in so many `rounds`
     """

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from efficientnerf.asset.tree import NerfTree, leaps
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.numba.tree.leaps import leaps
 from efficientnerf.backends.numba.tree_training.hits import come_near
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.training.patches import PatchGrid

@@ -19,7 +19,7 @@ import triton
 from torch import Tensor
 
 from efficientnerf.asset.cascades import brick_ranges, cascades_of
-from efficientnerf.asset.tree import NerfTree, leaps
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.transfer import constant, to_device
 from efficientnerf.backends.triton.launch import INTERPRETED
 from efficientnerf.backends.triton.tree_march import Cascades, Rays
@@ -86,7 +86,7 @@ def brick_arrays(tree: NerfTree, device: str | torch.device) -> tuple[Tensor, Te
     grids = []
     for n, (cascade, (first, end)) in enumerate(zip(cascades_of(tree), brick_ranges(tree), strict=True)):
         brick_index = torch.from_numpy(np.ascontiguousarray(cascade.brick_index)).to(device)
-        leap = torch.from_numpy((leaps(cascade.brick_index >= 0) if n else tree.leap).astype(np.int32)).to(device)
+        leap = torch.from_numpy((cascade.leap if n else tree.leap).astype(np.int32)).to(device)
         _bordered(brick_index, voxel_index, tree.brick, index[first:end])
         grids.append(torch.where(brick_index >= 0, brick_index, -leap))
     return torch.cat([grid.reshape(-1) for grid in grids]) if tree.outer else grids[0].contiguous(), index

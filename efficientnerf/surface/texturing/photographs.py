@@ -110,13 +110,13 @@ def _shown(seen: _Seen, photo: Photograph) -> tuple[np.ndarray, np.ndarray, np.n
     column, row = np.floor(np.clip(seen.pixels[at], -1, 1e9)).astype(np.int64).T
     inside = (column >= 0) & (row >= 0) & (column < photo.camera.width) & (row < photo.camera.height)
     at, column, row = at[inside], column[inside], row[inside]
-    slack = SLACK + _beside(photo) * np.sqrt(np.maximum(1 - seen.facing[at] ** 2, 0)) / seen.facing[at]
+    slack = SLACK + _pixel_shift(photo) * np.sqrt(np.maximum(1 - seen.facing[at] ** 2, 0)) / seen.facing[at]
     shown = (seen.depth[at] * seen.near[row, column] <= 1 + slack) & (seen.clear[row, column] >= CLEAR)
     return at[shown], column[shown], row[shown]
 
 
-def _beside(photo: Photograph) -> float:
-    """BESIDE pixels of a photograph, as a share of the depth."""
+def _pixel_shift(photo: Photograph) -> float:
+    """PIXEL_SHIFT pixels of a photograph, as a share of the depth."""
     intrinsics = photo.camera.intrinsics
     return PIXEL_SHIFT / min(float(intrinsics["fx"]), float(intrinsics["fy"]))
 
@@ -272,7 +272,7 @@ class PhotographTexture:
             tick()
             observe(
                 part.start, part.stop, self.texels.begin, self.texels.share, self.faces, seen.pixels, seen.depth, seen.facing, seen.near, seen.clear,
-                photo.colours, gains, np.float32(REACH), np.float32(SLACK), np.float32(_beside(photo)), density, sharpness, self.seen, self.weights,
+                photo.colours, gains, np.float32(REACH), np.float32(SLACK), np.float32(_pixel_shift(photo)), density, sharpness, self.seen, self.weights,
             )  # fmt: skip
 
     def finished(self, mesh: Mesh, tick: Callable[[], None] = _untold) -> tuple[np.ndarray, np.ndarray]:

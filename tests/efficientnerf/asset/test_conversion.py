@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from efficientnerf.asset.cascades import cascades_of, check_cascades, voxel_coordinates
-from efficientnerf.asset.conversion import lookup, pruned, with_degree, with_resolution
+from efficientnerf.asset.cascades import cascades_of, check_cascades, voxel_coordinates, voxels_at
+from efficientnerf.asset.conversion import pruned, with_degree, with_resolution
 from efficientnerf.asset.quantisation import compacted
 from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree, Region, tree_from_voxels
@@ -25,10 +25,10 @@ def same_pictures(a: NerfTree, b: NerfTree, tolerance: float = 1e-5) -> None:
 def test_coordinates_and_their_voxels(brick: int) -> None:
     tree = random_tree(brick, brick=brick)
     at = voxel_coordinates(tree)
-    assert np.array_equal(lookup(tree, at), np.arange(len(tree.density_values)))
+    assert np.array_equal(voxels_at(tree, cascades_of(tree)[0], at), np.arange(len(tree.density_values)))
     there = {tuple(row) for row in at.tolist()}
     every = np.argwhere(np.ones(np.array(tree.resolution) + 2, bool)) - 1
-    for place, voxel in zip(every.tolist(), lookup(tree, every), strict=True):
+    for place, voxel in zip(every.tolist(), voxels_at(tree, cascades_of(tree)[0], every), strict=True):
         assert (voxel >= 0) == (tuple(place) in there)
         assert voxel < 0 or at[voxel].tolist() == place
 

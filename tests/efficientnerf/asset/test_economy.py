@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from efficientnerf.asset.economy import DEFAULT_RATE, economised
+from efficientnerf.asset.economy import DEFAULT_RATE, economy_of
 from efficientnerf.asset.format import serialize
 from efficientnerf.asset.quantisation import compacted
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
@@ -28,7 +28,7 @@ def error(tree: NerfTree, coded: NerfTree, weight: np.ndarray) -> float:
 def test_a_greater_rate_takes_fewer_bytes_and_errs_more() -> None:
     tree = ball()
     weight = -np.expm1(-tree.density_values * tree.voxel)
-    coded = [economised(tree, weight, DEFAULT_RATE * factor, 64) for factor in (0.01, 1, 30)]
+    coded = [economy_of(tree, weight, 64).at(DEFAULT_RATE * factor) for factor in (0.01, 1, 30)]
     sizes = [len(serialize(one, "packed")) for one in coded]
     errors = [error(tree, one, weight) for one in coded]
     assert sizes[0] > sizes[1] > sizes[2]
@@ -40,7 +40,7 @@ def test_voxels_that_weigh_more_err_less() -> None:
     tree = ball()
     rng = np.random.default_rng(1)
     heavy = rng.random(len(tree.density_values)) < 0.5
-    coded = economised(tree, np.where(heavy, 1.0, 1e-3).astype(np.float32), 3e-5, 64)
+    coded = economy_of(tree, np.where(heavy, 1.0, 1e-3).astype(np.float32), 64).at(3e-5)
     wrong = ((tree.sh - coded.sh) ** 2).mean(axis=(1, 2))
     assert wrong[heavy].mean() < 0.5 * wrong[~heavy].mean()
     opacity, seen = (-np.expm1(-one.density_values * tree.voxel) for one in (tree, coded))
@@ -58,6 +58,6 @@ def test_codes_do_not_depend_on_the_order_of_voxels() -> None:
         density_values=tree.density_values[order],
         harmonics=tree.sh[order],
     )
-    data = serialize(economised(tree, entries=32), "packed")
-    assert serialize(economised(tree, entries=32), "packed") == data
-    assert serialize(economised(other, entries=32), "packed") == data
+    data = serialize(economy_of(tree, entries=32).at(DEFAULT_RATE), "packed")
+    assert serialize(economy_of(tree, entries=32).at(DEFAULT_RATE), "packed") == data
+    assert serialize(economy_of(other, entries=32).at(DEFAULT_RATE), "packed") == data

@@ -132,7 +132,7 @@ REFUSED = {
     "a focal length of text": ({"focal": "wide"}, "'focal' is wide; expected a number"),
     "a mirror": ({"world_from_camera": np.diag([1.0, 1, -1, 1]).tolist()}, "no rigid motion"),
     "another last row": ({"world_from_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0.5, 1]]}, "no rigid motion"),
-    "three rows": ({"world_from_camera": np.eye(4).tolist()[:3]}, "expected four rows"),
+    "three rows": ({"world_from_camera": np.eye(4).tolist()[:3]}, "expected 4 rows"),
     "a short row": ({"world_from_camera": [[1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, "expected 4 numbers"),
 }
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from efficientnerf.asset.conversion import lookup, pruned, with_degree, with_resolution
+from efficientnerf.asset.cascades import cascades_of, voxels_at
+from efficientnerf.asset.conversion import pruned, with_degree, with_resolution
 from efficientnerf.asset.format import describe, load, save
 from efficientnerf.asset.queries import colour_at, density_at
 from efficientnerf.asset.refinement.state import initial_state
@@ -32,7 +33,7 @@ def test_points_get_the_values_of_their_voxel(brick: int, degree: int) -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(tree.bounds_min - 0.1, tree.bounds_max + 0.1, (800, 3))
     directions = rays_at(tree, 800)[1]
-    voxel = lookup(tree, np.floor((points - tree.bounds_min) / tree.voxel).astype(np.int64))
+    voxel = voxels_at(tree, cascades_of(tree)[0], np.floor((points - tree.bounds_min) / tree.voxel).astype(np.int64))
     stored = voxel >= 0
     assert 0.02 < stored.mean() < 0.6
     assert np.array_equal(density_at(tree, points), np.where(stored, tree.density_values[voxel], 0))

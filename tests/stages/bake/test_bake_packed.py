@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from efficientnerf.asset.economy import DEFAULT_RATE, economised
+from efficientnerf.asset.economy import DEFAULT_RATE, economy_of
 from efficientnerf.asset.format import serialize
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
@@ -42,7 +42,7 @@ def tree() -> NerfTree:
 
 @pytest.mark.parametrize("share", [0.7])
 def test_codes_are_coarser_where_the_file_would_be_too_large(tree: NerfTree, share: float) -> None:
-    most = len(serialize(economised(tree), "packed"))
+    most = len(serialize(economy_of(tree).at(DEFAULT_RATE), "packed"))
     found, _, warned = packed(tree, int(share * most))
     assert 0.85 * share * most < len(serialize(found, "packed")) <= share * most
     assert not warned
@@ -52,7 +52,7 @@ def test_codes_are_coarser_where_the_file_would_be_too_large(tree: NerfTree, sha
 
 def test_voxels_that_weigh_least_go_where_the_coarsest_codes_are_too_large(tree: NerfTree, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(economy, "COARSEST", 10 * DEFAULT_RATE)
-    coarsest = len(serialize(economised(tree, rate=10 * DEFAULT_RATE), "packed"))
+    coarsest = len(serialize(economy_of(tree).at(10 * DEFAULT_RATE), "packed"))
     found, _, _ = packed(tree, coarsest // 2)
     assert len(serialize(found, "packed")) <= coarsest // 2
     assert len(found.density_values) < len(tree.density_values)

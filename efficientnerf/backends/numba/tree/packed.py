@@ -14,9 +14,9 @@ import numpy as np
 from efficientnerf.asset import cascades
 from efficientnerf.asset.cascades import cascades_of
 from efficientnerf.asset.palettes import PaletteHarmonics
-from efficientnerf.asset.tree import NerfTree, leaps
+from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.runtime import PRANGE, numba
-from efficientnerf.backends.numba.tree.leaps import octant_leaps
+from efficientnerf.backends.numba.tree.leaps import leaps, octant_leaps
 from efficientnerf.backends.numba.tree.packets.rows import MOST_SIDE, fill_rows, order_voxels
 from efficientnerf.rendering.harmonics import squared_slopes
 
