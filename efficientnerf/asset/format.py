@@ -18,7 +18,7 @@ from efficientnerf.asset.cascades import brick_ranges, bricks_of, cascades_of, c
 from efficientnerf.asset.file import packed, whole_scene
 from efficientnerf.asset.file.container import DTYPES, METADATA_KEY, FormatError, Header, write_whole
 from efficientnerf.asset.file.layouts import LAYOUTS
-from efficientnerf.asset.file.memory import check_memory, needed
+from efficientnerf.asset.file.memory import check_memory, counts_of
 from efficientnerf.asset.file.metadata import MAJOR, STEP_MINOR, STRUCTURE, check_metadata, layout_name, layout_of, lookup_of, ndc_of, step_size_of
 from efficientnerf.asset.file.serialisation import WRITERS, written_as
 from efficientnerf.asset.palettes import PaletteHarmonics
@@ -71,7 +71,7 @@ def serialize(tree: NerfTree, layout: str | None = None) -> bytes:
     if whole:
         whole_scene.check_whole_scene("the tree can't be saved", meta)
     data: bytes = save_tensors(tensors, metadata={METADATA_KEY: text})
-    check_memory("the tree can't be saved", written.layout, len(data), needed(written.layout, meta, shapes, types))
+    check_memory("the tree can't be saved", meta, len(data), shapes, types)
     return data
 
 
@@ -125,12 +125,6 @@ def _tensors_of(meta: dict[str, Any]) -> dict[str, tuple[str, ...]]:
     }
 
 
-def _bricks(shapes: dict[str, tuple[int, ...]]) -> int:
-    """B, from the shapes of the tensors that say it."""
-    shape = next(shapes[tensor] for tensor in ("brick.mask", "brick.density") if tensor in shapes)
-    return shape[0] if shape else 0
-
-
 def _open(path: str | Path) -> Header:
     """The header with its metadata and the tensors' shapes checked; no tensor is read."""
     header = Header(Path(path))
@@ -149,16 +143,17 @@ def _open(path: str | Path) -> Header:
     shapes = {tensor: header.tensors[tensor][1] for tensor in types}
     held, kinds = _held(header)
     rows = whole_scene.environment_rows(meta)
+    owners = held["brick.density" if layout_of(meta) == "full" else "brick.mask"]  # a row for each brick; not checked yet
     expected = {
         **{whole_scene.occupancy_name(n): (math.ceil(math.prod(grid.shape) / 8),) for n, grid in enumerate(whole_scene.grids_of(meta))},
         **layout.expected(name, meta, shapes),
         whole_scene.ENVIRONMENT: (rows, 2 * rows, 3),
-        whole_scene.REGION: (math.ceil(_bricks(held) / 8),),
+        whole_scene.REGION: (math.ceil((owners[0] if owners else 0) / 8),),
     }
     for tensor, shape in shapes.items():
         if shape != expected[tensor]:
             raise FormatError(f"{name}: tensor '{tensor}' has shape {shape}; expected {expected[tensor]}")
-    check_memory(name, layout_of(meta), header.size, needed(layout_of(meta), meta, held, kinds))
+    check_memory(name, meta, header.size, held, kinds)
     return header
 
 
@@ -251,8 +246,7 @@ def outline(path: str | Path) -> NerfTree:
     header = _open(path)
     name, meta = header.name, header.meta
     shapes, kinds = _held(header)
-    bricks, brick = _bricks(shapes), int(meta["brick"])
-    voxels = bricks * brick**3 if layout_of(meta) == "full" else shapes["voxel.density"][0]
+    (bricks, voxels), brick = counts_of(meta, shapes), int(meta["brick"])
     harmonics: np.ndarray | PaletteHarmonics = _sized((voxels, (int(meta["sh_degree"]) + 1) ** 2, 3), "<f4")
     if "voxel.base" in shapes:
         tables = _sized(shapes["base.table"], "<f4"), _sized(shapes["voxel.sh"], kinds["voxel.sh"]), _sized(shapes["sh.palette"], "<f4")
@@ -274,7 +268,7 @@ def describe(path: str | Path) -> dict[str, Any]:
     resolution = [n * brick for n in shape]
     low = [float(x) for x in meta["bounds_min"]]
     full = layout_of(meta) == "full"
-    voxels = math.prod(shapes["brick.density"]) if full else shapes["voxel.density"][0]
+    bricks, voxels = counts_of(meta, shapes)
     sizes = {name: end - begin for name, (_, _, begin, end) in sorted(header.tensors.items())}
     per_voxel = sum(size for name, size in sizes.items() if name.startswith("brick." if full else ("voxel.", "packed.")))
     facts = {
@@ -287,7 +281,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         "coarse_cells": shape,
         "brick": brick,
         "resolution": resolution,
-        "bricks": shapes["brick.density" if full else "brick.mask"][0],
+        "bricks": bricks,
         "voxels": voxels,
         "voxel_side": voxel,
         "sh_degree": meta["sh_degree"],

@@ -24,11 +24,8 @@ def colour_at(tree: NerfTree, points: np.ndarray, directions: np.ndarray | None 
 
 def density_block(tree: NerfTree, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
     """Density at the voxel centres low <= (i, j, k) < high of cascade 0: float32, zero outside of the grid and where nothing is stored."""
-    low_a, high_a = np.asarray(low), np.asarray(high)
-    if (high_a < low_a).any():
-        raise ValueError(f"density_block from {tuple(low)} to {tuple(high)}: the upper corner lies below the lower one")
-    out, d = np.zeros(tuple(high_a - low_a), np.float32), int(tree.brick)
-    begin, end = (np.clip(corner, 0, tree.resolution) for corner in (low_a, high_a))  # inside of the grid
+    out, d = np.zeros(np.subtract(high, low), np.float32), tree.brick
+    begin, end = (np.clip(corner, 0, tree.resolution) for corner in (low, high))  # inside of the grid
     first = begin // d
     brick = tree.brick_index[_box(first, -(-end // d))]  # (X, Y, Z)
     index = tree.voxel_index[brick[brick >= 0]]  # (B, d^3)
@@ -36,7 +33,7 @@ def density_block(tree: NerfTree, low: tuple[int, int, int], high: tuple[int, in
         bricks = np.zeros((*brick.shape, d**3), np.float32)
         bricks[brick >= 0] = np.where(index >= 0, tree.density_values[np.maximum(index, 0)], 0)
         voxels = bricks.reshape(*brick.shape, d, d, d).transpose(0, 3, 1, 4, 2, 5).reshape(np.multiply(brick.shape, d))
-        out[_box(begin - low_a, end - low_a)] = voxels[_box(begin - first * d, end - first * d)]
+        out[_box(begin - low, end - low)] = voxels[_box(begin - first * d, end - first * d)]
     return out
 
 

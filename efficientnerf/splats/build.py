@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.splats.gaussians import MAX_DEGREE, Gaussians
+from efficientnerf.splats.gaussians import Gaussians
 from efficientnerf.splats.merging import merged
 from efficientnerf.splats.refit import View, refitted
 
@@ -19,14 +19,10 @@ Progress = Callable[[int, int, str], None]
 class Budget:
     """Size of what is made, and the work of its refit."""
 
-    count: int = 200_000  # Gaussians at most
-    degree: int = 2  # of their harmonics, 0 to 3; at most the asset's
-    steps: int = 300  # of the refit, each of a picture or of rows of a large one; 0: the voxels merged, as they are
+    count: int  # Gaussians at most, one at least
+    degree: int  # of their harmonics, 0 to 3; at most the asset's
+    steps: int  # of the refit, each of a picture or of rows of a large one; 0: the voxels merged, as they are
     seed: int = 0  # of the order of the pictures
-
-    def __post_init__(self) -> None:
-        if self.count < 1 or self.steps < 0 or not 0 <= self.degree <= MAX_DEGREE:
-            raise ValueError(f"{self}: expected at least one Gaussian, harmonics of degree 0 to {MAX_DEGREE}, and no less than 0 steps")
 
 
 class NothingToShow(ValueError):
@@ -50,8 +46,9 @@ def gaussians_of_asset(
         if progress is not None:
             progress(done, budget.steps + 1, text)
 
-    def passed() -> float:
-        return 0.0 if time_used is None else min(time_used(), 1.0)
+    def reached(step: int) -> None:
+        passed = 0.0 if time_used is None else min(time_used(), 1.0)
+        report(max(step, int(budget.steps * passed)) + 1, "fitting Gaussians")
 
     report(0, "merging voxels")
     begun = max(1, int(START * budget.count)) if budget.steps else budget.count
@@ -61,7 +58,7 @@ def gaussians_of_asset(
     report(1, "fitting Gaussians")
     fitted = refitted(
         gaussians, views, budget.steps, most=budget.count, background=tree.background, seed=budget.seed,
-        reached=lambda step: report(max(step, int(budget.steps * passed())) + 1, "fitting Gaussians"), time_used=time_used, device=tree.device,
+        reached=reached, time_used=time_used, device=tree.device,
     )  # fmt: skip
     if not len(fitted):
         raise NothingToShow("no Gaussian is left that shows in any picture")

@@ -46,7 +46,7 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpne
     """
     if rounds <= 0 or not len(faces):
         return vertices
-    normals, _ = smoothed_face_normals(vertices, faces, rounds, sharpness)
+    normals = smoothed_face_normals(vertices, faces, rounds, sharpness)
     around = csr_matrix((np.ones(faces.size), (faces.ravel(), np.repeat(np.arange(len(faces)), 3))), shape=(len(vertices), len(faces)))
     count = np.maximum(np.diff(around.indptr), 1)[:, None]
     outer = np.stack([around @ (normals * normals[:, axis, None]) for axis in range(3)], 1)  # (V, 3, 3) sums of n n^T
@@ -66,18 +66,14 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpne
 def rounds_of(kind: tuple[int, int, float], rounds: int, vertices: np.ndarray, faces: np.ndarray) -> tuple[int, float]:
     """Rounds and sharpness of `smooth_normals` for a kind, one of NORMALS and the others, and so many rounds of `smooth`."""
     times, most, sharpness = kind
-    within = _rounds_within(REACH * float(np.linalg.norm(np.ptp(vertices, axis=0))), vertices, faces)
-    return min(times * rounds, most, within), sharpness
-
-
-def _rounds_within(reach: float, vertices: np.ndarray, faces: np.ndarray) -> int:
-    """How many rounds of smoothing spread over about `reach`, at least LEAST_ROUNDS: a round spreads over an edge, n rounds over the root of n edges."""
+    reach = REACH * float(np.linalg.norm(np.ptp(vertices, axis=0)))
     edge = float(np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=-1).mean())
-    return max(LEAST_ROUNDS, int(min((reach / max(edge, 1e-300)) ** 2, 1e6)))
+    within = int(min((reach / max(edge, 1e-300)) ** 2, 1e6))  # a round spreads over an edge, n rounds over the root of n edges
+    return min(times * rounds, most, max(LEAST_ROUNDS, within)), sharpness
 
 
-def smoothed_face_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpness: float) -> tuple[np.ndarray, np.ndarray]:
-    """(F, 3) unit normals of faces after `rounds` of bilateral smoothing (`smooth_normals`), and twice their areas (F,)."""
+def smoothed_face_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpness: float) -> np.ndarray:
+    """(F, 3) unit normals of faces after `rounds` of bilateral smoothing (`smooth_normals`)."""
     vectors, neighbours = face_vectors(vertices, faces), face_neighbours(faces, len(vertices))
     area = np.linalg.norm(vectors, axis=1)
     normals = vectors / np.maximum(area, 1e-300)[:, None]
@@ -85,7 +81,7 @@ def smoothed_face_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, 
     for _ in range(rounds):
         smooth_face_normals(normals, area, neighbours, sharpness, other)
         normals, other = other, normals
-    return normals, area
+    return normals
 
 
 def vertex_neighbours(faces: np.ndarray, count: int) -> tuple[Any, np.ndarray]:

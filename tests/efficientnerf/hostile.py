@@ -152,6 +152,10 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "a reference camera of text": (lambda: meta_with(layout="ndc-sparse", ndc="pinhole"), "'ndc' is pinhole; expected an object"),
     "a reference camera without focal length": (lambda: reference(focal=0), "'focal' is 0"),
     "a reference camera of three rows": (lambda: reference(world_from_camera=[[1, 0, 0, 0]] * 3), "expected 4 rows"),
+    "a reference camera without near plane": (lambda: reference(near=0), "'near' is 0"),
+    "a reference camera with a focal length of text": (lambda: reference(focal="wide"), "'focal' is wide"),
+    "a reference camera that mirrors": (lambda: reference(world_from_camera=np.diag([1.0, 1, -1, 1]).tolist()), "'ndc': "),
+    "a reference camera with another last row": (lambda: reference(world_from_camera=[*np.eye(4).tolist()[:3], [0, 0, 0.5, 1]]), "'ndc': "),
     "a reference camera of short rows": (lambda: reference(world_from_camera=[[1, 0, 0]] * 4), "expected 4 numbers"),
     "a reference camera that shears": (lambda: reference(world_from_camera=[[1, 1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "'ndc': "),
     # nearest lookup

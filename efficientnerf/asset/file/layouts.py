@@ -155,10 +155,8 @@ def _full_stored(name: str, meta: dict[str, Any], raw: Tensors) -> np.ndarray:
 
 
 def _full_values(name: str, meta: dict[str, Any], raw: Tensors, count: int) -> tuple[np.ndarray, np.ndarray]:
-    density = raw["brick.density"].reshape(-1).astype(np.float32)
-    sh = raw["brick.sh"].reshape(count, _harmonics_of(meta), 3).astype(np.float32)
-    _sound(name, density, sh)
-    return density, sh
+    every = {"voxel.density": raw["brick.density"].reshape(-1), "voxel.sh": raw["brick.sh"].reshape(count, _harmonics_of(meta), 3)}
+    return _sparse_values(name, meta, every, count)
 
 
 LAYOUTS = {

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.asset.file.container import FormatError
+from efficientnerf.asset.file.metadata import layout_of
 from efficientnerf.asset.file.whole_scene import environment_rows, grids_of
 from efficientnerf.rendering.harmonics import harmonics_count
 
@@ -25,15 +26,18 @@ _REASONS = (
 )
 
 
-def needed(layout: str, meta: dict[str, Any], shapes: dict[str, tuple[int, ...]], types: dict[str, np.dtype[Any]]) -> int:
-    """Bytes of FORMAT.md, section 10.
+def counts_of(meta: dict[str, Any], shapes: dict[str, tuple[int, ...]]) -> tuple[int, int]:
+    """How many bricks and stored voxels a file has, by the shapes of its tensors, or of those that it is unpacked to."""
+    if layout_of(meta) == "full":
+        bricks = shapes["brick.density"][0]
+        return bricks, bricks * int(meta["brick"]) ** 3
+    return shapes["brick.mask"][0], shapes["voxel.density"][0]
 
-    layout  without its prefixes
-    shapes, types  of the layout's tensors, or of those that it is unpacked to
-    """
-    cube, coefficients = int(meta["brick"]) ** 3, 3 * harmonics_count(int(meta["sh_degree"]))
-    bricks = shapes["brick.density" if layout == "full" else "brick.mask"][0]
-    voxels = bricks * cube if layout == "full" else shapes["voxel.density"][0]
+
+def needed(meta: dict[str, Any], shapes: dict[str, tuple[int, ...]], types: dict[str, np.dtype[Any]]) -> int:
+    """Bytes of FORMAT.md, section 10; shapes and types as in `check_memory`."""
+    cube, coefficients, layout = int(meta["brick"]) ** 3, 3 * harmonics_count(int(meta["sh_degree"])), layout_of(meta)
+    bricks, voxels = counts_of(meta, shapes)
     cells = sum(math.prod(grid.shape) for grid in grids_of(meta))
     total = CELL * cells + (BRICK + SLOT * cube) * bricks + ENVIRONMENT * environment_rows(meta) ** 2
     if layout not in ("compact", "packed"):
@@ -44,9 +48,13 @@ def needed(layout: str, meta: dict[str, Any], shapes: dict[str, tuple[int, ...]]
     return total + each * voxels + PALETTE * math.prod(shapes["sh.palette"][:2])
 
 
-def check_memory(name: str, layout: str, size: int, needed_bytes: int) -> None:
-    """Raises FormatError where a file of `size` bytes needs more than the rule allows."""
-    times = MAX_PACKED_RATIO if layout == "packed" else MAX_RATIO
-    if needed_bytes > times * size + FIXED_BYTES:
-        found = f"{size / 1e6:.1f} MB that take {needed_bytes / 1e6:.0f} MB of memory; expected at most {times} times the size and {FIXED_BYTES / 1e6:.0f} MB"
-        raise FormatError(f"{name}: {found}. {_REASONS[layout == 'packed']}")
+def check_memory(name: str, meta: dict[str, Any], size: int, shapes: dict[str, tuple[int, ...]], types: dict[str, np.dtype[Any]]) -> None:
+    """Raises FormatError where a file of `size` bytes needs more than the rule allows.
+
+    shapes, types  of the layout's tensors, or of those that it is unpacked to
+    """
+    packed, most = layout_of(meta) == "packed", needed(meta, shapes, types)
+    times = MAX_PACKED_RATIO if packed else MAX_RATIO
+    if most > times * size + FIXED_BYTES:
+        found = f"{size / 1e6:.1f} MB that take {most / 1e6:.0f} MB of memory; expected at most {times} times the size and {FIXED_BYTES / 1e6:.0f} MB"
+        raise FormatError(f"{name}: {found}. {_REASONS[packed]}")

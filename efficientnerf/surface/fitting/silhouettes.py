@@ -8,13 +8,12 @@ V vertices, F faces, H x W pixels.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from efficientnerf.geometry.cameras import Camera, project
+from efficientnerf.geometry.cameras import Camera, project, resized
 from efficientnerf.surface.agreement import OPAQUE, AssetView
 from efficientnerf.surface.mesh import vertex_normals
 from efficientnerf.surface.rasteriser import mesh_image
@@ -66,18 +65,13 @@ def _moves(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, camera:
     cosine = (towards * normals).sum(1) / np.linalg.norm(towards, axis=1)
     inside = ((pixels >= 1) & (pixels <= [camera.width - 1, camera.height - 1])).all(1)
     at = np.flatnonzero((np.abs(cosine) < GRAZING) & (depth > 0) & inside)
-    own = distance_inside(mesh_image(vertices, faces, _finer(camera)).covered)
+    own = distance_inside(mesh_image(vertices, faces, resized(camera, FINER * camera.width, FINER * camera.height)).covered)
     if own is None or not len(at):
         return at[:0], np.zeros(0)
     places = (FINER * pixels[at, ::-1] - 0.5).T
     mine, others = (map_coordinates(distance, places, order=1, mode="nearest") / FINER for distance in (own, edge))
     same = (np.abs(mine) <= NEAR) & (np.abs(others) <= REACH)
     return at[same], (others - mine)[same] * depth[at[same]] / camera.intrinsics["fx"]
-
-
-def _finer(camera: Camera) -> Camera:
-    """The camera with FINER times as many pixels along a side."""
-    return replace(camera, width=FINER * camera.width, height=FINER * camera.height, params=tuple(FINER * value for value in camera.params))
 
 
 def _asset_edge(view: AssetView) -> np.ndarray | None:

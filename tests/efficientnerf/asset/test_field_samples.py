@@ -41,7 +41,7 @@ def made() -> Made:
 
 
 def boxes(count: int, voxel: float = 0.05) -> list[np.ndarray]:
-    return [np.stack([low, low + np.array(shape) * BRICK * side]) for shape, side, low in cascade_grids(BOX, voxel, BRICK, count)]
+    return [grid.bounds(BRICK) for grid in cascade_grids(BOX, voxel, BRICK, count)]
 
 
 def test_the_samples_are_those_of_the_pixels(made: Made) -> None:
@@ -69,10 +69,6 @@ def test_voxels_weigh_what_passes_through_them(made: Made) -> None:
     _, _, every = made
     begin = 5 * 32 * 32 + 14 * 32  # of the sixth view: wall, ball and ground
     end = begin + 6 * 32
-    part = slice(int(every.first[begin]), int(every.first[end]))
-    cut = {name: getattr(every, name)[part] for name in ("start", "extent", "weight", "thickness", "colour")}
-    cut |= {name: getattr(every, name)[begin:end] for name in ("pixel", "view", "direction", "opacity", "behind")}
-    samples = replace(every, first=every.first[begin : end + 1] - part.start, **cut)
     grids = cascade_grids(BOX, 0.05, BRICK, 3)
     wanted: dict[tuple[int, ...], float] = {}
     for ray in range(begin, end):
@@ -90,7 +86,7 @@ def test_voxels_weigh_what_passes_through_them(made: Made) -> None:
                     key = (cascade, *index.tolist())
                     wanted[key] = max(wanted.get(key, 0.0), share)
     found = {}
-    for cascade, (seen, (shape, _, _)) in enumerate(zip(cascade_visibility(samples, grids, BRICK, 1e-3), grids, strict=True)):
+    for cascade, (seen, (shape, _, _)) in enumerate(zip(cascade_visibility(every.part(begin, end), grids, BRICK, 1e-3), grids, strict=True)):
         row, local = np.nonzero(seen.greatest)
         cell = np.stack(np.unravel_index(seen.cells[row], shape), axis=-1) * BRICK + np.stack(np.unravel_index(local, (BRICK,) * 3), axis=-1)
         found |= {(cascade, *at): float(w) for at, w in zip(cell.tolist(), seen.greatest[row, local], strict=True)}

@@ -22,7 +22,7 @@ from efficientnerf.asset.file.metadata import STRUCTURE
 from efficientnerf.asset.format import LAYOUTS, FormatError, describe, load, save, serialize
 from efficientnerf.asset.queries import colour_at, density_at
 from efficientnerf.asset.rendering import render_rays
-from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.tree import NerfTree, Region
 from tests.efficientnerf import nerftree_reader, packed_reader
 from tests.efficientnerf.damaged import METADATA, NESTED, ORBIT, added, blob, header_with, joined, meta_with, padded, parts, tiny
 from tests.efficientnerf.hostile import HOSTILE
@@ -66,9 +66,9 @@ def test_what_is_saved_is_loaded_and_saved_again_to_the_same_bytes(tmp_path: Pat
 
 
 def test_bricks_are_written_in_the_order_of_their_cells() -> None:
-    """A tree whose bricks and voxels are numbered otherwise is the same tree, and the same file."""
-    tree = random_tree(3)
-    rng = np.random.default_rng(0)
+    """A tree whose bricks, those of its region too, and voxels are numbered otherwise is the same tree, and the same file."""
+    rng, made = np.random.default_rng(0), random_tree(3)
+    tree = replace(made, region=Region(np.stack([made.bounds_min, made.bounds_max]), bricks=rng.random(len(made.voxel_index)) < 0.5))
     bricks, voxels = rng.permutation(len(tree.voxel_index)), rng.permutation(len(tree.density_values))
     back = np.argsort(voxels)
     other = replace(
@@ -77,6 +77,7 @@ def test_bricks_are_written_in_the_order_of_their_cells() -> None:
         voxel_index=np.where(tree.voxel_index >= 0, back[tree.voxel_index], -1)[bricks].astype(np.int32),
         density_values=tree.density_values[voxels],
         harmonics=tree.sh[voxels],
+        region=replace(tree.region, bricks=tree.region.bricks[bricks]),  # type: ignore[type-var, index, union-attr]
     )
     points = np.random.default_rng(1).uniform(tree.bounds_min, tree.bounds_max, (100, 3))
     assert np.array_equal(density_at(other, points), density_at(tree, points))

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from efficientnerf.asset.cascades import cascades_of
-from efficientnerf.asset.format import WRITERS, FormatError, describe, load, save, serialize
+from efficientnerf.asset.format import WRITERS, FormatError, describe, load, save
 from efficientnerf.asset.quantisation import quantised_density
 from efficientnerf.asset.tree import NerfTree, Region
 from tests.efficientnerf.tree_reference import render_reference
-from tests.efficientnerf.trees import LOW, random_cascades, random_tree, rays_at, tensors
+from tests.efficientnerf.trees import LOW, random_cascades, rays_at, tensors
 
 
 def region(tree: NerfTree, seed: int = 0) -> Region:
@@ -74,19 +74,6 @@ def test_every_layout_holds_a_whole_scene(tmp_path: Path, layout: str) -> None:
         if layout == "sparse":
             torch.testing.assert_close(colour, expected)
         torch.testing.assert_close(opacity, full)
-
-
-def test_bricks_of_a_region_follow_the_order_of_the_file(tmp_path: Path) -> None:
-    """A tree whose bricks are numbered otherwise is the same tree, and the same file."""
-    made = random_tree(3)
-    tree = replace(made, region=region(made))
-    order = np.random.default_rng(0).permutation(len(tree.voxel_index))
-    number = np.argsort(order).astype(np.int32)
-    other = replace(
-        tree, brick_index=np.where(tree.brick_index >= 0, number[tree.brick_index], -1).astype(np.int32), voxel_index=tree.voxel_index[order],
-        region=replace(tree.region, bricks=tree.region.bricks[order]),
-    )  # fmt: skip
-    assert serialize(other) == serialize(tree)
 
 
 @pytest.mark.parametrize(

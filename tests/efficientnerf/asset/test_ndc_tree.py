@@ -1,14 +1,11 @@
 """Trees in normalised device coordinates: planes of the world at their depth, lookups by world points, harmonics along world directions."""
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset import format
 from efficientnerf.asset.cascades import voxel_coordinates
 from efficientnerf.asset.queries import colour_at, density_at, normal_at
 from efficientnerf.asset.rendering import render, render_rays
@@ -124,32 +121,3 @@ def test_frame_rays_are_where_the_grid_is() -> None:
     point = tree.ndc.points(origins + seen.depth[:, None].astype(np.float64) * directions)
     along = point - warped.origins
     np.testing.assert_allclose(np.cross(along, warped.directions), 0, atol=1e-6)
-
-
-REFUSED = {
-    "none": (None, "'ndc' is None; expected an object"),
-    "no near plane": ({"near": 0}, "'near' is 0; expected a number"),
-    "a focal length of text": ({"focal": "wide"}, "'focal' is wide; expected a number"),
-    "a mirror": ({"world_from_camera": np.diag([1.0, 1, -1, 1]).tolist()}, "no rigid motion"),
-    "another last row": ({"world_from_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0.5, 1]]}, "no rigid motion"),
-    "three rows": ({"world_from_camera": np.eye(4).tolist()[:3]}, "expected 4 rows"),
-    "a short row": ({"world_from_camera": [[1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, "expected 4 numbers"),
-}
-
-
-@pytest.mark.parametrize("which", REFUSED)
-def test_a_file_without_a_sound_reference_camera_is_refused(which: str, tmp_path: Path) -> None:
-    change, message = REFUSED[which]
-    data = format.serialize(wall(voxels=24))
-    length = int.from_bytes(data[:8], "little")
-    header = json.loads(data[8 : 8 + length])
-    meta = json.loads(header["__metadata__"]["nerftree"])
-    assert meta["layout"] == "ndc-sparse"  # which readers of before refuse by name
-    meta["ndc"] = None if change is None else meta["ndc"] | change
-    header["__metadata__"]["nerftree"] = json.dumps(meta)
-    text = json.dumps(header).encode()
-    (tmp_path / "a.nerftree").write_bytes(len(text).to_bytes(8, "little") + text + data[8 + length :])
-    with pytest.raises(format.FormatError, match=message):
-        format.load(tmp_path / "a.nerftree")
-    with pytest.raises(format.FormatError, match=message):
-        format.describe(tmp_path / "a.nerftree")

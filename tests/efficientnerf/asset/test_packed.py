@@ -17,6 +17,7 @@ from efficientnerf.asset.quantisation import compacted
 from efficientnerf.backends.numba.entropy import rans
 from efficientnerf.backends.numba.runtime import numba
 from tests.efficientnerf.nerftree_reader import Tree
+from tests.efficientnerf.threads import on_threads
 from tests.efficientnerf.trees import TREES, random_cascades, random_tree
 
 
@@ -128,15 +129,11 @@ def test_slices_of_any_size_hold_the_same_on_any_number_of_threads(tmp_path: Pat
     slices = -(-about["bricks"] // contents(tmp_path / "p.nerftree")[0]["packed"]["slice_bricks"])
     assert 1 < slices <= about["voxels"] // most
     theirs = Tree(tmp_path / "p.nerftree")
-    threads = numba.get_num_threads()
-    try:
-        for count in {1, numba.config.NUMBA_NUM_THREADS}:
-            numba.set_num_threads(count)
+    for count in {1, numba.config.NUMBA_NUM_THREADS}:
+        with on_threads(count):
             assert serialize(tree, "packed") == data
             again = load(tmp_path / "p.nerftree")
             save(again, tmp_path / "b.nerftree")
             assert (tmp_path / "a.nerftree").read_bytes() == (tmp_path / "b.nerftree").read_bytes()
-    finally:
-        numba.set_num_threads(threads)
     assert np.array_equal(theirs.densities.astype(np.float32), again.density_values)
     assert np.array_equal(theirs.sh.astype(np.float32), again.sh)

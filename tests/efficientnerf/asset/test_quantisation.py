@@ -56,9 +56,6 @@ def test_the_nearest_is_the_nearest(count: int, size: int, entries: int) -> None
     np.testing.assert_allclose(approached, np.minimum(squared[:, 0], 1), rtol=1e-5, atol=1e-6)
 
 
-# Values
-
-
 # Layouts
 
 

@@ -9,8 +9,9 @@ import pytest
 from efficientnerf.asset.format import serialize
 from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.asset.quantisation import compacted
+from efficientnerf.asset.refinement import fit
 from efficientnerf.asset.refinement.fit import error
-from efficientnerf.asset.refinement.quantised import refit
+from efficientnerf.asset.refinement.quantised import _rising, refit
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.tree import NerfTree
 from tests.efficientnerf.balls import pixels
@@ -54,8 +55,6 @@ def test_the_same_is_found_every_time_and_no_step_changes_nothing() -> None:
 
 def test_a_worse_tree_is_never_made(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps that lead astray are not taken over."""
-    from efficientnerf.asset.refinement import fit
-
     def astray(state: Any, *_: Any, until: int, **__: Any) -> Any:
         state.tree.sh[:] += np.array([40, -40, 40], np.float32)
         state.square_sh[:] = 1
@@ -68,8 +67,6 @@ def test_a_worse_tree_is_never_made(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_densities_that_would_meet_or_pass_each_other_keep_their_order() -> None:
-    from efficientnerf.asset.refinement.quantised import _rising
-
     found = _rising(np.array([0, 3, 3, 1, 5], np.float32))
     assert (np.diff(found) > 0).all()
     np.testing.assert_allclose(found, [0, 3, 3, 3, 5], rtol=1e-6)

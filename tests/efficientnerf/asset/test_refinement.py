@@ -3,7 +3,6 @@
 from dataclasses import replace
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 
@@ -17,26 +16,12 @@ from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.layout import EARLY_STOP
 from efficientnerf.backends.numba.tree.cells import cells_of, dense_densities, voxel_places
-from efficientnerf.backends.numba.tree.contributions import max_contributions
 from efficientnerf.backends.numba.tree_training import gradients as kernels
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
 from efficientnerf.training.pixels import Pixels
 from tests.efficientnerf.balls import BOUNDS, cameras, picture, pixels
-from tests.efficientnerf.refinements import ball_tree, gradients, gradients_by_autograd, seen_at_random, sum_gradients
+from tests.efficientnerf.refinements import ball_tree, gradients, seen_at_random, sum_gradients
 from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
-
-
-@pytest.mark.parametrize(("brick", "degree", "opacity_weight"), [(1, 0, 0.0), (3, 1, 0.7), (4, 2, 0.0), (2, 3, 0.7)])
-def test_values_and_gradients_are_those_of_autograd(brick: int, degree: int, opacity_weight: float) -> None:
-    tree = random_tree(brick, brick=brick, degree=degree)
-    origins, directions = rays_at(tree, 300)
-    seen = seen_at_random(300, opacity_weight)
-    loss, by_density, by_sh = gradients(tree, origins, directions, seen)
-    wanted, wanted_by_density, wanted_by_sh = gradients_by_autograd(tree, origins, directions, seen)
-    np.testing.assert_allclose(loss, wanted, atol=2e-6)  # the kernel's harmonics are of float32 directions
-    np.testing.assert_allclose(by_density, wanted_by_density, atol=2e-5 * np.abs(wanted_by_density).max())
-    np.testing.assert_allclose(by_sh, wanted_by_sh, atol=2e-5 * np.abs(wanted_by_sh).max())
-    assert (by_density != 0).mean() > 0.5
 
 
 def test_float32_and_the_early_stop_change_little() -> None:
@@ -110,58 +95,25 @@ def test_photographs_are_compared_over_the_environment() -> None:
         Targets(some, None)
 
 
-def test_any_background_is_the_mean_over_random_ones() -> None:
-    some = pixels(6, 16)
-    tree = ball_tree()
-    targets = Targets(some, (1.0, 1.0, 1.0))
-    index = np.arange(600, 700)
+@pytest.mark.parametrize("alpha", [True, False])
+def test_objects_and_boxes_to_infinity_are_compared_over_the_mean_of_random_backgrounds(alpha: bool) -> None:
+    """Pictures without alpha: what reaches to infinity should be opaque."""
+    some, tree, index = pixels(6, 16), ball_tree(), np.arange(600, 700)
+    if not alpha:
+        some.images = np.ascontiguousarray(some.images[:, :3])
+    ground = 1.0 if alpha else 0.5
+    targets = Targets(some, (ground,) * 3, reaches_infinity=not alpha)
     origins, directions, seen = targets.of(index)
     loss = gradients(tree, origins, directions, seen, np.float32)[0]
-    rng = np.random.default_rng(0)
     seen_as = render_rays(tree, origins, directions)
-    rgba = some.images[index] / 255
-    behind = rng.random((20000, 1, 3))
-    truth = rgba[:, :3] * rgba[:, 3:] + behind * (1 - rgba[:, 3:])
+    picture_of, behind = some.images[index] / 255, np.random.default_rng(0).random((20000, 1, 3))
+    share = picture_of[:, 3:] if alpha else 1.0
+    truth = picture_of[:, :3] * share + behind * (1 - share)
     drawn = ((seen_as.colour + behind * (1 - seen_as.opacity[:, None]) - truth) ** 2).sum(axis=2).mean(axis=0)
     np.testing.assert_allclose(loss, drawn, atol=0.02)
-    white = targets.of(index, constant_background=True)[2]
-    assert white.opacity_weight == 0
-    np.testing.assert_array_equal(white.background, 1)
-
-
-def test_what_reaches_to_infinity_should_be_opaque_before_any_background() -> None:
-    some = pixels(6, 16)
-    some.images = np.ascontiguousarray(some.images[:, :3])
-    tree = ball_tree()
-    targets = Targets(some, (0.5, 0.5, 0.5), reaches_infinity=True)
-    index = np.arange(600, 700)
-    origins, directions, seen = targets.of(index)
-    loss = gradients(tree, origins, directions, seen, np.float32)[0]
-    seen_as = render_rays(tree, origins, directions)
-    behind = np.random.default_rng(0).random((20000, 1, 3))
-    drawn = ((seen_as.colour + behind * (1 - seen_as.opacity[:, None]) - some.images[index] / 255) ** 2).sum(axis=2).mean(axis=0)
-    np.testing.assert_allclose(loss, drawn, atol=0.02)
-    declared = targets.of(index, constant_background=True)[2]
-    assert declared.opacity_weight == 0
-    np.testing.assert_array_equal(declared.background, 0.5)
-
-
-def test_the_same_bytes_interrupted_or_not_on_one_thread_or_two() -> None:
-    targets = Targets(pixels(6, 16), (1.0, 1.0, 1.0))
-    whole, _ = fitted(ball_tree(), targets, 12)
-    again = initial_state(ball_tree())
-    rates: dict[str, Any] = {"rays": 512, "density_lr": 0.3, "sh_lr": 0.05, "fall": lambda step: 0.1 ** (step / 12), "seed": 1}
-    list(optimise(again, targets, until=5, **rates))
-    threads = numba.get_num_threads()
-    try:
-        numba.set_num_threads(1)
-        list(optimise(again, targets, until=12, **rates))
-    finally:
-        numba.set_num_threads(threads)
-    np.testing.assert_array_equal(again.result().density_values, whole.density_values)
-    np.testing.assert_array_equal(again.result().sh, whole.sh)
-    other, _ = fitted(ball_tree(), targets, 12, seed=2)
-    assert not np.array_equal(other.sh, whole.sh)
+    constant = targets.of(index, constant_background=True)[2]
+    assert constant.opacity_weight == 0
+    np.testing.assert_array_equal(constant.background, ground)
 
 
 def test_weights_are_what_voxels_contribute() -> None:
@@ -179,41 +131,3 @@ def test_weights_are_what_voxels_contribute() -> None:
     without = subset(tree, weights > np.median(weights))
     assert len(without.density_values) == (weights > np.median(weights)).sum()
     np.testing.assert_array_equal(voxel_coordinates(without), at[weights > np.median(weights)])
-
-
-def weights_by_hand(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """Samples of FORMAT.md, section 6, one after the other."""
-    out, number = np.zeros(len(tree.density_values)), {tuple(at): n for n, at in enumerate(voxel_coordinates(tree).tolist())}
-    size = np.array(tree.resolution)
-    for ray, (origin, along) in enumerate(zip((origins - tree.bounds_min) / tree.voxel, directions, strict=True)):
-        with np.errstate(divide="ignore"):
-            faces = np.stack([-origin / along, (size - origin) / along])
-        begin, end, light = max(faces.min(axis=0).max(), 0.0), faces.max(axis=0).min(), 1.0
-        for t in np.arange(begin + 0.25, end, 0.5):
-            point = origin + t * along
-            sigma = float(density_at(tree, (tree.bounds_min + point * tree.voxel)[None])[0])
-            alpha = 1 - np.exp(-sigma * 0.5 * tree.voxel)
-            low = np.floor(point - 0.5).astype(int)
-            for corner in np.ndindex(2, 2, 2):
-                v = number.get(tuple((low + corner).tolist()), -1)
-                share = np.prod(np.where(corner, point - 0.5 - low, 1.5 - point + low))
-                if v >= 0:
-                    out[v] = max(out[v], gain[ray] * light * alpha * share)
-            light *= 1 - alpha
-    return out
-
-
-def test_greatest_weights_are_those_of_a_march_by_hand() -> None:
-    tree = random_tree(3, shape=(2, 3, 2), brick=3, sigma=6.0)
-    origins, directions = rays_at(tree, 40)
-    gain = np.random.default_rng(0).random(40).astype(np.float32)
-    start, along, _ = in_voxels(tree, origins, directions)
-    found = []
-    for parts in (1, 3):
-        into = np.zeros((parts, len(tree.density_values)), np.float32)
-        for half in (slice(0, 25), slice(25, 40)):  # what is known is raised
-            max_contributions(cells_of(tree), start[half], along[half], tree.density_values, gain[half], into, stop=0.0)
-        found.append(into.max(axis=0))
-    np.testing.assert_array_equal(*found)
-    np.testing.assert_allclose(found[0], weights_by_hand(tree, origins, directions, gain), atol=1e-5)
-    assert (found[0] > 0).mean() > 0.3

@@ -7,9 +7,7 @@ from efficientnerf.asset.queries import colour_at, density_at, density_block, no
 from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from tests import reference
-from tests.efficientnerf.trees import LOW, random_tree
-
-TREES = [(1, 0), (3, 1), (4, 2), (5, 3), (2, 4)]
+from tests.efficientnerf.trees import LOW, TREES, random_tree
 
 
 def queried(tree: NerfTree, count: int = 150) -> np.ndarray:

@@ -12,7 +12,7 @@ from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.backends.splat_layout import SplatState
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.geometry.ndc import Ndc
-from efficientnerf.rendering.harmonics import C0
+from efficientnerf.rendering.harmonics import C0, basis_numpy
 from efficientnerf.splats import merging, refit
 from efficientnerf.splats.build import Budget, gaussians_of_asset
 from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
@@ -59,8 +59,6 @@ def test_colours_are_those_of_the_asset_from_all_directions() -> None:
     begin = np.arange(len(shown.voxels) + 1)
     out = np.empty((len(shown.voxels), 9, 3), np.float32)
     merging._convert(tree, shown, begin, shown.pixels, out, degree)
-    from efficientnerf.rendering.harmonics import basis_numpy
-
     directions = rng.normal(size=(200, 3))
     basis = basis_numpy(directions / np.linalg.norm(directions, axis=1, keepdims=True), degree)
     wanted = 1 / (1 + np.exp(-np.einsum("dk,nkc->ndc", basis, tree.sh[shown.voxels])))
@@ -160,12 +158,12 @@ def test_the_refit_ends_with_its_time_and_learning_rates_and_divisions_follow_it
     assert ample.means.tobytes() == refitted(begun, views, 40, most=150).means.tobytes()
     assert len(short) > len(begun) >= len(none), "they are divided although a quarter of 40 steps is all that was taken"
 
+
 @pytest.mark.parametrize(("channels", "count", "rate"), [(3, 5, 0.001), (3, 80, 0.001), (3, 160, 0.002), (3, 1000, 0.003), (4, 5, 0.004)])
 def test_few_photographs_move_view_dependence_less_than_many_and_than_pictures_with_alpha(channels: int, count: int, rate: float) -> None:
     camera = Camera("view", 4, 3, "SIMPLE_PINHOLE", (4.0, 2.0, 1.5), np.eye(4))
     views = [refit.View(camera, np.zeros((3, 4, channels), np.uint8))] * count
     assert refit.harmonics_rate(views) == pytest.approx(rate)
-
 
 
 def test_large_pictures_are_taken_in_bands_that_show_what_the_whole_shows(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,15 +7,15 @@ import pytest
 
 from efficientnerf.asset.tree import NerfTree, Region, tree_from_voxels
 from efficientnerf.backends.numba.mesh.fusion import CONFIDENCE, FILLED, NEAREST, A, B, W, fit_planes, fuse
-from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.queries import density_at, distance_back
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.surface import fusion as module
 from efficientnerf.surface.agreement import AssetView, asset_view
 from efficientnerf.surface.fusion import Fusion, front_depth, fused_opacity
-from efficientnerf.surface.mesh import face_vectors, topology
+from efficientnerf.surface.mesh import Mesh, face_vectors, topology
 from efficientnerf.surface.nested import scene_surface
+from tests.efficientnerf.threads import on_threads
 from tests.efficientnerf.walls import DEPTH, NEAR, looking_along_y, wall
 
 VOXEL, RADIUS = 0.05, 0.5
@@ -109,13 +109,9 @@ def test_a_ball_has_its_distances_on_any_number_of_threads() -> None:
     assert (distance[away > 3.5] > 2.5).all()
     assert (weight[away < -4] == 0).all()  # nothing is known of what lies deeper
     assert (fused(fusion, FILLED)[0][away < -4] == -3).all()  # but that it is behind all that views see
-    before = numba.get_num_threads()
-    try:
-        numba.set_num_threads(1)
+    with on_threads(1):
         for one, other in zip(fused(fusion), (distance, weight), strict=True):
             np.testing.assert_array_equal(one, other)
-    finally:
-        numba.set_num_threads(before)
 
 
 def test_views_carve_what_they_see_through_and_nothing_else() -> None:
@@ -193,14 +189,17 @@ def test_fused_depths_lie_where_little_of_the_light_is_gone() -> None:
     np.testing.assert_allclose(gone, module.ABSORBED, atol=0.04)
 
 
+def mesh_of(tree: NerfTree, threshold: float, views: list[AssetView], faces: int = 4000, rounds: int = 5, region: Region | None = None) -> Mesh:
+    more = {"viewpoints": np.zeros((0, 3)), "progress": lambda *_: None}
+    return scene_surface(tree, threshold, faces=faces, min_component=0.01, rounds=rounds, views=views, region=region, **more)
+
+
 def test_a_noisy_ball_is_smooth_and_where_it_is() -> None:
     tree = soft_ball(noise=1.0)
     views = [asset_view(tree, camera(direction, (80, 80))) for direction in DIRECTIONS]
 
     def errors(fused: list[AssetView]) -> tuple[float, float]:
-        mesh = scene_surface(
-            tree, 25.0, faces=4000, min_component=0.01, rounds=5, viewpoints=np.zeros((0, 3)), progress=lambda *_: None, views=fused
-        )  # fmt: skip
+        mesh = mesh_of(tree, 25.0, fused)
         assert topology(mesh.vertices, mesh.faces).watertight
         vectors, outward = face_vectors(mesh.vertices, mesh.faces), mesh.vertices[mesh.faces].mean(1)
         cosine = (vectors * outward).sum(1) / np.linalg.norm(vectors, axis=1) / np.linalg.norm(outward, axis=1)
@@ -217,9 +216,7 @@ def test_a_region_cuts_cleanly() -> None:
     region = Region(np.array([[-0.9, -0.9, -0.9], [0.9, 0.9, 0.2]]), 0.0, 0.04)
     views = [asset_view(tree, camera(direction)) for direction in DIRECTIONS]
     for fused in (views, []):
-        mesh = scene_surface(
-            tree, 25.0, faces=4000, min_component=0.01, rounds=0, viewpoints=np.zeros((0, 3)), progress=lambda *_: None, views=fused, region=region
-        )  # fmt: skip
+        mesh = mesh_of(tree, 25.0, fused, rounds=0, region=region)
         lid = mesh.vertices[np.linalg.norm(mesh.vertices[:, :2], axis=1) < 0.35]
         lid = lid[lid[:, 2] > 0]
         assert topology(mesh.vertices, mesh.faces).watertight
@@ -279,9 +276,7 @@ def test_a_noisy_wall_before_a_reference_camera_is_smooth() -> None:
     forward = tree.ndc.world_from_camera[:3, 2]  # type: ignore[union-attr]
 
     def angle(fused: list[AssetView]) -> float:
-        mesh = scene_surface(
-            tree, 0.5 / float(tree.voxel), faces=20_000, min_component=0.01, rounds=5, viewpoints=np.zeros((0, 3)), progress=lambda *_: None, views=fused
-        )  # fmt: skip
+        mesh = mesh_of(tree, 0.5 / float(tree.voxel), fused, faces=20_000)
         at = (mesh.vertices - tree.ndc.world_from_camera[:3, 3]) @ tree.ndc.world_from_camera[:3, :3]  # type: ignore[union-attr]
         vectors, middle = face_vectors(mesh.vertices, mesh.faces), at[mesh.faces].mean(1)
         front = (np.abs(middle[:, :2]) < 1.5).all(1) & (vectors @ forward < 0) & (np.abs(middle[:, 2] - DEPTH - 0.3 * middle[:, 0]) < 1)

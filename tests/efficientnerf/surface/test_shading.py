@@ -10,6 +10,7 @@ from efficientnerf.surface import shading
 from efficientnerf.surface.mesh import Mesh, Texture
 from efficientnerf.surface.shading import Shader, vertex_colours
 from tests.efficientnerf.surface.texturing.shapes import ball, cameras
+from tests.efficientnerf.threads import on_threads
 
 FRONT = np.eye(4)
 FRONT[:3, 3] = [0, 0, -2.0]
@@ -93,15 +94,10 @@ def test_hostile_meshes_end_nothing() -> None:
 
 
 def test_the_image_is_the_same_on_one_thread_and_on_two() -> None:
-    import numba
-
-    shader, threads = Shader(sheet(smooth_picture(64), 0.4)), numba.get_num_threads()
+    shader = Shader(sheet(smooth_picture(64), 0.4))
     first = shader.images(VIEW)[0].colour
-    try:
-        numba.set_num_threads(1)
+    with on_threads(1):
         np.testing.assert_array_equal(shader.images(VIEW)[0].colour, first)
-    finally:
-        numba.set_num_threads(threads)
 
 
 def test_bands_of_rows_are_the_whole_image(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numba import get_num_threads, set_num_threads
 
 from efficientnerf.geometry.cameras import project
 from efficientnerf.surface.mesh import Mesh, vertex_normals
 from efficientnerf.surface.texturing.atlas import atlas_of
 from efficientnerf.surface.texturing.filling import carried_on
 from efficientnerf.surface.texturing.photographs import REACH, PhotographTexture, Survey, edge_distance, exposed_alike, photograph, survey
+from tests.efficientnerf.threads import on_threads
 
 from .shapes import ball, box, cameras, pattern, photographed, textured
 
@@ -132,14 +132,9 @@ def test_masks_and_alpha_are_kept_to() -> None:
 def test_the_same_bytes_on_any_number_of_threads() -> None:
     vertices, faces = ball(3)
     photos = [photographed(vertices, faces, camera) for camera in cameras(5)]
-    before = get_num_threads()
     first = textured(vertices, faces, photos)[1]
-    try:
-        set_num_threads(1)
-        again = textured(vertices, faces, photos)[1]
-    finally:
-        set_num_threads(before)
-    np.testing.assert_array_equal(first, again)
+    with on_threads(1):
+        np.testing.assert_array_equal(textured(vertices, faces, photos)[1], first)
 
 
 def test_a_texel_sees_all_pixels_that_lie_in_it() -> None:
