@@ -12,7 +12,7 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _adam_line(value, grad, first, second, n, beta1, beta2, scale1, scale2, eps):  # type: ignore[no-untyped-def]
+def _adam_line(value, grad, first, second, n, beta1, beta2, scale1, scale2, eps):
     """Adam on those of a line's values from n on whose gradient is not zero; clears the gradient. Reads nothing else where all gradients are zero."""
     g = load(grad, n, LINE)
     some = ~(g == _ZERO)
@@ -28,7 +28,7 @@ def _adam_line(value, grad, first, second, n, beta1, beta2, scale1, scale2, eps)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _adam_range(value, grad, first, second, begin, end, beta1, beta2, scale1, scale2, eps, skip_zeros):  # type: ignore[no-untyped-def]
+def _adam_range(value, grad, first, second, begin, end, beta1, beta2, scale1, scale2, eps, skip_zeros):
     """Values begin to end; branch-free, so that LLVM vectorises it."""
     one, zero = np.float32(1), np.float32(0)
     one_minus_beta1, one_minus_beta2 = one - beta1, one - beta2
@@ -45,7 +45,7 @@ def _adam_range(value, grad, first, second, begin, end, beta1, beta2, scale1, sc
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def adam(value, grad, first, second, learning_rate, beta1, beta2, correction1, correction2, eps, skip_zeros):  # type: ignore[no-untyped-def]
+def adam(value, grad, first, second, learning_rate, beta1, beta2, correction1, correction2, eps, skip_zeros):
     """A step of Adam in place, on flat float32 arrays of one length; clears the gradient.
 
     correction1, correction2  1 - beta^step: bias corrections of the moments

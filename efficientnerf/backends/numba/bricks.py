@@ -8,12 +8,12 @@ import numpy as np
 from efficientnerf.backends.numba.runtime import PRANGE, numba
 
 RAYS = 256  # per task
+MARGIN = 0.5  # voxels; the box is enlarged and the hole shrunk by so much, to skip samples surely outside or hidden; the others are tested one by one
+MAX_PIECES = 64  # of a sample that reaches through many voxels
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def threshold_and_dilate(
-    cells: np.ndarray, greatest: np.ndarray, threshold: float, shape: tuple[int, int, int], brick: int, dilate: int, row_of: np.ndarray, into: np.ndarray
-) -> None:
+def threshold_and_dilate(cells, greatest, threshold, shape, brick, dilate, row_of, into):
     """Set `into` for each voxel whose weight exceeds `threshold`, and for those up to `dilate` voxels away along each axis, inside the grid.
 
     cells     flat indices (x slowest) of the coarse cells that the rows of `greatest` (., brick^3) belong to
@@ -36,7 +36,7 @@ def threshold_and_dilate(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def flat_indices(into: np.ndarray, cells: np.ndarray, shape: tuple[int, int, int], brick: int, flat: np.ndarray) -> None:
+def flat_indices(into, cells, shape, brick, flat):
     """Flat indices in the grid (x slowest) of the voxels set in `into` (B, brick^3) bool, whose rows belong to `cells`, to `flat` (N,)."""
     n = 0
     for row in range(len(cells)):
@@ -50,7 +50,7 @@ def flat_indices(into: np.ndarray, cells: np.ndarray, shape: tuple[int, int, int
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def coordinates_of(flat, rows, columns, index):  # type: ignore[no-untyped-def]
+def coordinates_of(flat, rows, columns, index):
     """Coordinates (N, 3) int32 of flat indices (N,) in a grid (., rows, columns)."""
     for n in numba.prange(len(flat)):
         rest, column = divmod(flat[n], columns)
@@ -58,7 +58,7 @@ def coordinates_of(flat, rows, columns, index):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _raise_voxel(x, y, z, weight, shape, brick, row_of, into, rows):  # type: ignore[no-untyped-def]
+def _raise_voxel(x, y, z, weight, shape, brick, row_of, into, rows):
     """Raise voxel (x, y, z) to a weight, in the row of its cell, which gets one if it has none and there is room; returns the number of rows in use."""
     owner = (x // brick * shape[1] + y // brick) * shape[2] + z // brick
     if row_of[owner] < 0:
@@ -72,10 +72,7 @@ def _raise_voxel(x, y, z, weight, shape, brick, row_of, into, rows):  # type: ig
 
 
 @numba.njit(cache=True, error_model="numpy")
-def resample_weights(
-    cells: np.ndarray, greatest: np.ndarray, threshold: float, shape: tuple[int, int, int], to_shape: tuple[int, int, int], ratio: float, brick: int,
-    row_of: np.ndarray, into: np.ndarray, rows: int,
-) -> int:  # fmt: skip
+def resample_weights(cells, greatest, threshold, shape, to_shape, ratio, brick, row_of, into, rows):
     """Raise the voxels of a coarser grid to the weights above `threshold` of the finer voxels whose centres they hold; returns the number of rows in use.
 
     ratio   side of a finer voxel over that of a coarser one
@@ -96,14 +93,8 @@ def resample_weights(
     return rows
 
 
-MAX_PIECES = 64  # of a sample that reaches through many voxels
-
-
-MARGIN = 0.5  # voxels; the box is enlarged and the hole shrunk by so much, to skip samples surely outside or hidden; the others are tested one by one
-
-
 @numba.njit(error_model="numpy")
-def _way_through(origin, direction, low, high):  # type: ignore[no-untyped-def]
+def _way_through(origin, direction, low, high):
     """Where a ray enters and leaves a box; leaving before entering where it misses it."""
     enters, leaves = -np.inf, np.inf
     for axis in range(3):
@@ -117,9 +108,7 @@ def _way_through(origin, direction, low, high):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def weigh_voxels(  # type: ignore[no-untyped-def]
-    origin, direction, first, start, extent, weight, thickness, threshold, shape, voxel, low, hole, brick, row_of, into, rows
-) -> int:
+def weigh_voxels(origin, direction, first, start, extent, weight, thickness, threshold, shape, voxel, low, hole, brick, row_of, into, rows):
     """Raise voxels to the weights above `threshold` of samples that pass through them; returns the number of rows in use.
 
     origin, direction, first  of rays: (R, 3), (R, 3), (R + 1,)
@@ -160,7 +149,7 @@ def weigh_voxels(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def greatest_around(indices: np.ndarray, greatest: np.ndarray, shape: tuple[int, int, int], brick: int, row_of: np.ndarray, out: np.ndarray) -> None:
+def greatest_around(indices, greatest, shape, brick, row_of, out):
     """The greatest weight of voxels (N, 3), and that of each and the 26 around it, to the columns of `out` (N, 2).
 
     greatest  (B, brick^3) of the coarse cells of which `row_of` (cells,) int32 has the row, or -1
@@ -180,7 +169,7 @@ def greatest_around(indices: np.ndarray, greatest: np.ndarray, shape: tuple[int,
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def boxes_of_samples(origin, direction, first, start, extent, boxes, out):  # type: ignore[no-untyped-def]
+def boxes_of_samples(origin, direction, first, start, extent, boxes, out):
     """Number of the first of the boxes (L, 2, 3) float64 that holds the middle of each sample, L where none does, to out (M,) int64; the rest as for
     `weigh_voxels`, in float32."""
     rays = len(first) - 1

@@ -15,7 +15,7 @@ BLOCK = 64  # rays per task
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def activate_density(x, exponential):  # type: ignore[no-untyped-def]
+def activate_density(x, exponential):
     """Density of a raw density, and its derivative; exponential, or softplus(x - 1)."""
     one = np.float32(1)
     if exponential:
@@ -29,7 +29,7 @@ def activate_density(x, exponential):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def composite(raw, length, first, harmonics, background, exponential, colour, opacity, distortion, weight, rgb):  # type: ignore[no-untyped-def]
+def composite(raw, length, first, harmonics, background, exponential, colour, opacity, distortion, weight, rgb):
     """`efficientnerf.rendering.compositing.composite`, forward.
 
     raw, length, first     packed samples: (N, 1 + 3K), (N,), (R + 1,)
@@ -71,7 +71,7 @@ def composite(raw, length, first, harmonics, background, exponential, colour, op
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _weight_grad(g0, g1, g2, rgb, g_distortion, w, length, middle, front_weight, front_moment, all_weight, all_moment):  # type: ignore[no-untyped-def]
+def _weight_grad(g0, g1, g2, rgb, g_distortion, w, length, middle, front_weight, front_moment, all_weight, all_moment):
     """Gradient with respect to a sample's weight: of the colours, and of the distortion loss, 2 sum_j w_j |s - s_j| + 2/3 w l."""
     two = np.float32(2)
     back_weight, back_moment = all_weight - front_weight - w, all_moment - front_moment - w * middle
@@ -80,7 +80,7 @@ def _weight_grad(g0, g1, g2, rgb, g_distortion, w, length, middle, front_weight,
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def composite_backward(  # type: ignore[no-untyped-def]
+def composite_backward(
     raw, length, first, harmonics, background, exponential, weight, rgb,
     grad_colour, grad_opacity, grad_distortion, grad_weight, grad_raw, grad_background,
 ):  # fmt: skip
@@ -136,7 +136,7 @@ def composite_backward(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def scaled_by_distance(values, start, first, subject, out):  # type: ignore[no-untyped-def]
+def scaled_by_distance(values, start, first, subject, out):
     """`efficientnerf.rendering.compositing.scaled_by_distance`; writes out (N, C)."""
     rays, one = len(subject), np.float32(1)
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):

@@ -25,7 +25,7 @@ TASK_SAMPLES = 2**15  # samples per task, at most: 32 features of as many take 4
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _corner_indices(points, first, count, side, begin, dense, mask, index, weight):  # type: ignore[no-untyped-def]
+def _corner_indices(points, first, count, side, begin, dense, mask, index, weight):
     """Table indices (8, BLOCK) and trilinear weights (8, BLOCK) of the corners of some points' cells; corner c = 4x + 2y + z."""
     one, next_one = np.float32(1), np.uint32(1)
     cells, top, zero = np.float32(side - 1), np.int32(side - 2), np.int32(0)
@@ -53,7 +53,7 @@ def _corner_indices(points, first, count, side, begin, dense, mask, index, weigh
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _prefetch_level(entries, side, dense, start, mask, samples):  # type: ignore[no-untyped-def]
+def _prefetch_level(entries, side, dense, start, mask, samples):
     """Prefetch a level in memory order if the samples read about all of it."""
     count = side**3 if dense else np.int64(mask) + 1
     if LINES_PER_SAMPLE * samples * ENTRIES_PER_LINE >= count:
@@ -62,7 +62,7 @@ def _prefetch_level(entries, side, dense, start, mask, samples):  # type: ignore
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def transpose_points(points, out):  # type: ignore[no-untyped-def]
+def transpose_points(points, out):
     """points (N, 3) into out (3, N)."""
     count = len(points)
     for task in numba.prange((count + TRANSPOSE_BLOCK - 1) // TRANSPOSE_BLOCK):
@@ -71,7 +71,7 @@ def transpose_points(points, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _encode(points, table, sides, dense, starts, mask, tasks, out):  # type: ignore[no-untyped-def]
+def _encode(points, table, sides, dense, starts, mask, tasks, out):
     samples = points.shape[1]
     task_samples, entries = (samples + tasks - 1) // tasks, pointer(table)
     for task in numba.prange(tasks):
@@ -107,7 +107,7 @@ def encode(points: np.ndarray, table: np.ndarray, sides: np.ndarray, dense: np.n
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _encode_backward(points, grad, sides, dense, starts, mask, order, table_grad):  # type: ignore[no-untyped-def]
+def _encode_backward(points, grad, sides, dense, starts, mask, order, table_grad):
     samples, entries = points.shape[1], pointer(table_grad)
     for task in numba.prange(len(order)):
         level = order[task]

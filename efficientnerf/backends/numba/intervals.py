@@ -14,30 +14,30 @@ _NONE, _QUARTER, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.25), np.float32
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _row(state, n):  # type: ignore[no-untyped-def]
+def _row(state, n):
     return load(state, n * LANES, LANES)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _point_at(state, t):  # type: ignore[no-untyped-def]
+def _point_at(state, t):
     """Points at distances along the rays, unit coordinates."""
     return _row(state, UX) + t * _row(state, VX), _row(state, UY) + t * _row(state, VY), _row(state, UZ) + t * _row(state, VZ)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _norm(x, y, z):  # type: ignore[no-untyped-def]
+def _norm(x, y, z):
     """Maximum norm, at least 1."""
     return maximum(maximum(absolute(x), absolute(y)), maximum(absolute(z), _ONE))
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _along(x, side):  # type: ignore[no-untyped-def]
+def _along(x, side):
     """Number of the voxel at a grid coordinate along an axis; 0 for NaN."""
     return to_int32(minimum(maximum(x * np.float32(side), _NONE), np.float32(side - 1)))
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def next_intervals(state, voxels, side, step, farthest, contracted):  # type: ignore[no-untyped-def]
+def next_intervals(state, voxels, side, step, farthest, contracted):
     """Advance each ray by one interval: bit n of the result is set where ray n had not left the space, bit LANES + n where the interval is valid.
 
     state, voxels  pointers to the rows above and to (side, side, side) float32

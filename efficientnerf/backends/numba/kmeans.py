@@ -14,7 +14,7 @@ ALONE = 64 * LANES  # vectors that one thread has compared before others have be
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def nearest_centroids(vectors_t, centroids, index, distance):  # type: ignore[no-untyped-def]
+def nearest_centroids(vectors_t, centroids, index, distance):
     """Index of the nearest centroid of each vector, the first of equals, and the squared distance to it.
 
     vectors_t  (D, n) float32, transposed: the inner loops run over vectors, and are vectorised
@@ -46,7 +46,7 @@ def nearest_centroids(vectors_t, centroids, index, distance):  # type: ignore[no
 
 
 @numba.njit(cache=True, error_model="numpy")
-def sum_clusters(vectors, index, total, count):  # type: ignore[no-untyped-def]
+def sum_clusters(vectors, index, total, count):
     """Add each vector to the sum of its cluster `index` (n,), in order: total (P, D) float64, count (P,) int64."""
     for n in range(vectors.shape[0]):
         count[index[n]] += 1
@@ -55,7 +55,7 @@ def sum_clusters(vectors, index, total, count):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def lower_distances(vectors_t, centroid, distance):  # type: ignore[no-untyped-def]
+def lower_distances(vectors_t, centroid, distance):
     """Lower distance (n,) to the squared distance from `centroid` (D,) to each of vectors_t (D, n) where that is less."""
     count = vectors_t.shape[1]
     if count <= ALONE:
@@ -67,7 +67,7 @@ def lower_distances(vectors_t, centroid, distance):  # type: ignore[no-untyped-d
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _lower(vectors_t, centroid, distance, begin, lanes):  # type: ignore[no-untyped-def]
+def _lower(vectors_t, centroid, distance, begin, lanes):
     """The same for so many vectors from `begin` on."""
     squared = np.zeros(lanes, np.float32)
     for d in range(vectors_t.shape[0]):

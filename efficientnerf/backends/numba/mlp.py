@@ -54,7 +54,7 @@ def _round_up(count: int, step: int = LANES) -> int:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _pack_weight(weight, per_word, forward, back):  # type: ignore[no-untyped-def]
+def _pack_weight(weight, per_word, forward, back):
     """weight (O, I) into the layouts of both passes."""
     outputs, inputs = weight.shape
     padded = np.zeros((per_word * len(back), back.shape[1]), np.float32)
@@ -85,7 +85,7 @@ def pack_weights(weights: list[np.ndarray], bfloat16: bool) -> PackedWeights:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _copy_block(x, row, column, height, width, out):  # type: ignore[no-untyped-def]
+def _copy_block(x, row, column, height, width, out):
     """x[row : row + height, column : column + width] into the top left of out; zeros elsewhere."""
     out[:] = 0
     for i in range(height):
@@ -94,7 +94,7 @@ def _copy_block(x, row, column, height, width, out):  # type: ignore[no-untyped-
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _forward(inputs, first, middle, last, offset, element, chunk, activations, out):  # type: ignore[no-untyped-def]
+def _forward(inputs, first, middle, last, offset, element, chunk, activations, out):
     """activations  (L, N rounded up to blocks, W) of the hidden layers, for the backward pass; (L, 0, W) keeps none
     element      an empty array of the activations' type
     """
@@ -137,7 +137,7 @@ def _forward(inputs, first, middle, last, offset, element, chunk, activations, o
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _layer_backward(grad_out, grad_out_pairs, activations, activation_pairs, weight, grad_weight, grad_in, per_word):  # type: ignore[no-untyped-def]
+def _layer_backward(grad_out, grad_out_pairs, activations, activation_pairs, weight, grad_weight, grad_in, per_word):
     """Adds the gradient of a layer's weights to `grad_weight`, and writes that of its inputs, the ReLU's `activations`, to `grad_in`.
 
     All are Rows, but grad_out_pairs and activation_pairs: pointers to the gradient of the outputs as pairs of samples, and to scratch.
@@ -151,7 +151,7 @@ def _layer_backward(grad_out, grad_out_pairs, activations, activation_pairs, wei
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _grad_inputs(grad, words, transposed, weight, out, features):  # type: ignore[no-untyped-def]
+def _grad_inputs(grad, words, transposed, weight, out, features):
     """Gradient of the inputs, by feature, from that of the first layer's outputs, by sample; `transposed` is scratch."""
     for i in range(0, words, LANES):
         for n in range(0, BLOCK, LANES):
@@ -160,7 +160,7 @@ def _grad_inputs(grad, words, transposed, weight, out, features):  # type: ignor
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _backward(grad, inputs, first_back, middle_back, last_back, element, chunk, activations, grad_first, grad_middle, grad_last, grad_inputs):  # type: ignore[no-untyped-def]
+def _backward(grad, inputs, first_back, middle_back, last_back, element, chunk, activations, grad_first, grad_middle, grad_last, grad_inputs):
     """grad_first (C, I rounded up to ROWS, W), grad_middle (C, L - 1, W, W), grad_last (C, V, W): of the weights for each chunk, the first transposed."""
     (features, samples), outputs = inputs.shape, grad.shape[1]
     layers, width, padded_outputs, padded_inputs = len(middle_back) + 1, last_back.shape[1], grad_last.shape[1], first_back.shape[1]

@@ -15,7 +15,7 @@ RANDOM_BITS = 21  # of a coordinate in its cell
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def cells_of_points(point, side, cell):  # type: ignore[no-untyped-def]
+def cells_of_points(point, side, cell):
     """`efficientnerf.sampling.occupancy.cell_of` of points (N, 3) into cell (N,) int32."""
     for block in numba.prange((len(cell) + BLOCK - 1) // BLOCK):
         for n in range(block * BLOCK, min(len(cell), (block + 1) * BLOCK)):
@@ -26,7 +26,7 @@ def cells_of_points(point, side, cell):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def update_occupancy_maximum(cell, raw, exponential, flat, parts):  # type: ignore[no-untyped-def]
+def update_occupancy_maximum(cell, raw, exponential, flat, parts):
     """Raise voxels `flat` (D^3,) to the density of samples in cells (N,) int32, `raw` (N,) activated; masked voxels (-inf) stay masked.
 
     parts  of the voxels, one for each thread, which looks at all samples: no two threads write to one voxel
@@ -44,7 +44,7 @@ def update_occupancy_maximum(cell, raw, exponential, flat, parts):  # type: igno
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _random(seed, n):  # type: ignore[no-untyped-def]
+def _random(seed, n):
     """The n-th number of 64 bits of a seed, both uint64."""
     z = seed + (n + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -53,7 +53,7 @@ def _random(seed, n):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def points_in_cells(cell, side, seed, point):  # type: ignore[no-untyped-def]
+def points_in_cells(cell, side, seed, point):
     """A random point (N, 3), grid coordinates, in each of the cells (N,) int32; seed uint64."""
     mask, unit = np.uint64(2**RANDOM_BITS - 1), np.float32(2.0**-RANDOM_BITS)
     size = np.float32(side)
@@ -66,7 +66,7 @@ def points_in_cells(cell, side, seed, point):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def random_cells(flat, threshold, seed, half, cell):  # type: ignore[no-untyped-def]
+def random_cells(flat, threshold, seed, half, cell):
     """`efficientnerf.sampling.occupancy.random_cells`: the first `half` of cell (N,) int32 among all voxels `flat` (D^3,), the others among the valid.
 
     Returns how many are drawn: N, or `half` where none is valid.

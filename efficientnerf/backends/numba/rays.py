@@ -20,7 +20,7 @@ def ndc_numbers(ndc: Ndc) -> np.ndarray:
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def warp_ray(x, y, z, dx, dy, dz, ndc):  # type: ignore[no-untyped-def]
+def warp_ray(x, y, z, dx, dy, dz, ndc):
     """`Ndc.rays` of a ray from (x, y, z) along (dx, dy, dz): origin and direction, and the way back, begin, ds_dt and dlogz_dt; `ndc` see `ndc_numbers`."""
     a, b, near = ndc[12], ndc[13], ndc[14]
     x, y, z = x - ndc[9], y - ndc[10], z - ndc[11]
@@ -41,14 +41,14 @@ def warp_ray(x, y, z, dx, dy, dz, ndc):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def world_distance(along, begin, ds_dt, dlogz_dt):  # type: ignore[no-untyped-def]
+def world_distance(along, begin, ds_dt, dlogz_dt):
     """`efficientnerf.geometry.ndc.world_distance` of one point, float32."""
     rest = ds_dt - dlogz_dt * along
     return np.float32(begin + along / rest) if rest > 1e-6 * ds_dt else np.float32(np.inf)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def world_normal(x, y, z, nx, ny, nz, ndc):  # type: ignore[no-untyped-def]
+def world_normal(x, y, z, nx, ny, nz, ndc):
     """`Ndc.world_normals` of one normal at a point, float32."""
     depth = 2 * ndc[14] / max(1 - z, 1e-9)
     x, y = x * depth / ndc[12], y * depth / ndc[13]
@@ -63,7 +63,7 @@ def world_normal(x, y, z, nx, ny, nz, ndc):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _warp_rays(origins, directions, ndc, start, along, begin, ds_dt, dlogz_dt):  # type: ignore[no-untyped-def]
+def _warp_rays(origins, directions, ndc, start, along, begin, ds_dt, dlogz_dt):
     for block in numba.prange((len(origins) + BLOCK - 1) // BLOCK):
         for n in range(block * BLOCK, min(len(origins), block * BLOCK + BLOCK)):
             x, y, z, dx, dy, dz, begin[n], ds_dt[n], dlogz_dt[n] = warp_ray(
@@ -83,7 +83,7 @@ def warp_rays(ndc: Ndc, origins: np.ndarray, directions: np.ndarray) -> NdcRays:
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _unwarp_hits(start, along, begin, ds_dt, dlogz_dt, distance, normal, ndc, out_distance, out_normal):  # type: ignore[no-untyped-def]
+def _unwarp_hits(start, along, begin, ds_dt, dlogz_dt, distance, normal, ndc, out_distance, out_normal):
     for block in numba.prange((len(start) + BLOCK - 1) // BLOCK):
         for n in range(block * BLOCK, min(len(start), block * BLOCK + BLOCK)):
             s = np.float64(distance[n])
@@ -109,7 +109,7 @@ def unwarp_hits(ndc: Ndc, warped: NdcRays, distance: np.ndarray, normal: np.ndar
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def pixel_rays(tables, stride, index, origins, directions, near, far):  # type: ignore[no-untyped-def]
+def pixel_rays(tables, stride, index, origins, directions, near, far):
     """`efficientnerf.backends.torch.rays.pixel_rays` into origins and directions (R, 3), near and far (R,)."""
     lookup, lens, knots, offsets, width, rotation, centre, all_near, all_far = tables
     one = np.float32(1)
@@ -144,7 +144,7 @@ def pixel_rays(tables, stride, index, origins, directions, near, far):  # type: 
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def basis(directions, degree, out):  # type: ignore[no-untyped-def]
+def basis(directions, degree, out):
     """`efficientnerf.rendering.harmonics.basis` of unit directions (R, 3) into out (R, K); products in its order, so that both give the same bytes."""
     one, two, three, four, seven = np.float32(1), np.float32(2), np.float32(3), np.float32(4), np.float32(7)
     c = _FACTORS

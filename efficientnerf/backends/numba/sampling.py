@@ -30,7 +30,7 @@ class Box(NamedTuple):
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _unit_to_grid(x, y, z, contracted):  # type: ignore[no-untyped-def]
+def _unit_to_grid(x, y, z, contracted):
     """Grid coordinates, [0, 1]^3, of a point in unit coordinates; contraction: Barron et al. 2022, "mip-NeRF 360", equation 10, with the maximum norm."""
     one, two = np.float32(1), np.float32(2)
     if contracted:
@@ -42,7 +42,7 @@ def _unit_to_grid(x, y, z, contracted):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _init_lane(origins, directions, near, far, centre, half, contracted, r, state, lane):  # type: ignore[no-untyped-def]
+def _init_lane(origins, directions, near, far, centre, half, contracted, r, state, lane):
     """Write ray r, clipped to the box of a bounded space, to a lane of the state of `next_intervals`."""
     ux, uy, uz = (origins[r, 0] - centre[0]) / half[0], (origins[r, 1] - centre[1]) / half[1], (origins[r, 2] - centre[2]) / half[2]
     vx, vy, vz = directions[r, 0] / half[0], directions[r, 1] / half[1], directions[r, 2] / half[2]
@@ -64,7 +64,7 @@ def _init_lane(origins, directions, near, far, centre, half, contracted, r, stat
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _find_valid(rays, box, step, max_intervals, voxels, threshold, unpruned, counts, visited, t_exit, starts):  # type: ignore[no-untyped-def]
+def _find_valid(rays, box, step, max_intervals, voxels, threshold, unpruned, counts, visited, t_exit, starts):
     """March rays in groups of one per SIMD lane; writes the starts (R, max_intervals) of valid intervals, and of each ray how many are valid and visited."""
     (origins, directions, near, far, offset), (centre, half, contracted) = rays, box
     farthest, never, side, grid = np.float32(FARTHEST), np.float32(-np.inf), voxels.shape[0], pointer(voxels)
@@ -94,7 +94,7 @@ def _find_valid(rays, box, step, max_intervals, voxels, threshold, unpruned, cou
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _write_valid(rays, box, step, t_exit, starts, first, start, extent, length, point):  # type: ignore[no-untyped-def]
+def _write_valid(rays, box, step, t_exit, starts, first, start, extent, length, point):
     """Pack the intervals that `_find_valid` found."""
     (origins, directions, _near, _far, offset), (centre, half, contracted) = rays, box
     one = np.float32(1)
@@ -132,7 +132,7 @@ def valid_samples(bundle: RayBundle, box: Box, step: float, max_intervals: int, 
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def select_pivots(weight, first, threshold, max_pivots, out):  # type: ignore[no-untyped-def]
+def select_pivots(weight, first, threshold, max_pivots, out):
     """`efficientnerf.sampling.pivotal.select_pivots` into out (N,) bool."""
     rays = len(first) - 1
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):
@@ -157,7 +157,7 @@ def select_pivots(weight, first, threshold, max_pivots, out):  # type: ignore[no
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _write_pivotal(rays, box, first, coarse, pivotal, per_pivot, fine_first, fine_start, fine_extent, fine_length, point):  # type: ignore[no-untyped-def]
+def _write_pivotal(rays, box, first, coarse, pivotal, per_pivot, fine_first, fine_start, fine_extent, fine_length, point):
     """Divides the pivotal ones of the samples `coarse`."""
     (origins, directions, _near, _far, offset), (centre, half, contracted), (start, extent, length, _point) = rays, box, coarse
     for block in numba.prange((len(origins) + BLOCK - 1) // BLOCK):

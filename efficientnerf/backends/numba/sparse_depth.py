@@ -12,13 +12,13 @@ BLOCK = 64  # rays per task
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _past(n, start, extent, distance, width):  # type: ignore[no-untyped-def]
+def _past(n, start, extent, distance, width):
     """How far behind the point the middle of sample n lies, in widths."""
     return (start[n] + extent[n] / np.float32(2) - distance) / max(width * extent[n], np.float32(1e-12))
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _light(begin, end, weight, start, extent, distance, width):  # type: ignore[no-untyped-def]
+def _light(begin, end, weight, start, extent, distance, width):
     """Of a ray's samples: the light that reaches the point, and the weight that ends at it."""
     before = ending = np.float32(0)
     for n in range(begin, end):
@@ -31,7 +31,7 @@ def _light(begin, end, weight, start, extent, distance, width):  # type: ignore[
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def sparse_depth_errors(weight, start, extent, first, distance, on_support, width, out):  # type: ignore[no-untyped-def]
+def sparse_depth_errors(weight, start, extent, first, distance, on_support, width, out):
     """`efficientnerf.backends.torch.sparse_depth.sparse_depth_errors` into out (A,)."""
     zero, one, rays, before = np.float32(0), np.float32(1), len(distance), len(first) - 1 - len(distance)
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):
@@ -48,7 +48,7 @@ def sparse_depth_errors(weight, start, extent, first, distance, on_support, widt
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def sparse_depth_errors_backward(grad, weight, start, extent, first, distance, on_support, width, grad_weight):  # type: ignore[no-untyped-def]
+def sparse_depth_errors_backward(grad, weight, start, extent, first, distance, on_support, width, grad_weight):
     """Gradient of the weights (N,), zero before, from grad (A,)."""
     zero, one, least, rays, before = np.float32(0), np.float32(1), np.float32(LEAST_LIGHT), len(distance), len(first) - 1 - len(distance)
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):

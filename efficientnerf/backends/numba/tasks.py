@@ -6,7 +6,7 @@ STRIDE = 64  # at least as many as a machine has cores
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def interleaved(task, count):  # type: ignore[no-untyped-def]
+def interleaved(task, count):
     """A permutation of 0 to `count` - 1: first each STRIDE-th, then each one after these, ...
 
     numba gives each thread one run of a loop's numbers. Of work whose costly parts lie side by side (rows of an image, layers of a volume) one thread would get

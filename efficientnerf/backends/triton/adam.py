@@ -12,7 +12,7 @@ BLOCK = 1024
 
 
 @triton.jit
-def _adam(  # type: ignore[no-untyped-def]
+def _adam(
     value, grad, first, second, count, rate, beta1, beta2, correction1, correction2, epsilon,
     SKIP_ZEROS: tl.constexpr, ON_DEVICE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip

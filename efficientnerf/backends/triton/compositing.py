@@ -25,7 +25,7 @@ LARGEST = tl.constexpr(LARGEST_LOGIT)
 
 
 @triton.jit
-def _activate(x, EXPONENTIAL: tl.constexpr):  # type: ignore[no-untyped-def]
+def _activate(x, EXPONENTIAL: tl.constexpr):
     """Density and its derivative; see `efficientnerf.rendering.compositing.activate`."""
     if EXPONENTIAL:
         density = tl.exp(tl.minimum(x, LARGEST))
@@ -39,7 +39,7 @@ def _activate(x, EXPONENTIAL: tl.constexpr):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _forward(  # type: ignore[no-untyped-def]
+def _forward(
     raw, length, first, harmonics, background, colour, opacity, distortion, weight, rgb,
     K: tl.constexpr, KP: tl.constexpr, EXPONENTIAL: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip
@@ -95,7 +95,7 @@ def _forward(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _totals(raw, length, weight, begin, end, WIDTH: tl.constexpr, EXPONENTIAL: tl.constexpr, CHUNK: tl.constexpr):  # type: ignore[no-untyped-def]
+def _totals(raw, length, weight, begin, end, WIDTH: tl.constexpr, EXPONENTIAL: tl.constexpr, CHUNK: tl.constexpr):
     """Of a ray: optical depth, length, weight and moment of all its samples, and where the chunk after the last one begins."""
     total_depth = 0.0
     total_length = 0.0
@@ -117,7 +117,7 @@ def _totals(raw, length, weight, begin, end, WIDTH: tl.constexpr, EXPONENTIAL: t
 
 
 @triton.jit
-def _backward(  # type: ignore[no-untyped-def]
+def _backward(
     raw, length, first, harmonics, background, weight, rgb, grads, grad_raw, grad_background,
     K: tl.constexpr, KP: tl.constexpr, EXPONENTIAL: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip

@@ -11,7 +11,7 @@ FACTORS = tl.constexpr((harmonics.C0, -harmonics.C1, harmonics.C1, -harmonics.C1
 
 
 @triton.jit
-def harmonic(direction, TERM: tl.constexpr):  # type: ignore[no-untyped-def]
+def harmonic(direction, TERM: tl.constexpr):
     """The TERM-th harmonic of directions (R,)."""
     x, y, z = direction.x, direction.y, direction.z
     xx, yy, zz = x * x, y * y, z * z
@@ -69,7 +69,7 @@ def harmonic(direction, TERM: tl.constexpr):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def basis_columns(direction, term, K: tl.constexpr):  # type: ignore[no-untyped-def]
+def basis_columns(direction, term, K: tl.constexpr):
     """(R, C): harmonic `term` (C,) of each column along directions (R,); 0 in columns whose term is not below K."""
     basis = tl.zeros_like(direction.x)[:, None] + tl.zeros_like(term)[None, :].to(tl.float32)
     for n in tl.static_range(K):

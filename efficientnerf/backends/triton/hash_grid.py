@@ -25,7 +25,7 @@ FEATURES = 2
 
 
 @triton.jit
-def _cells(points, n, live, level, levels):  # type: ignore[no-untyped-def]
+def _cells(points, n, live, level, levels):
     """Lower corner and fraction (Vec3 each) of points in a level's grid; and the level's resolution, start in the table and whether it is dense."""
     resolution = tl.load(levels + level * 3).to(tl.int32)
     start = tl.load(levels + level * 3 + 1)
@@ -41,7 +41,7 @@ def _cells(points, n, live, level, levels):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _corner(low, fraction, resolution, dense, mask, CORNER: tl.constexpr):  # type: ignore[no-untyped-def]
+def _corner(low, fraction, resolution, dense, mask, CORNER: tl.constexpr):
     """Entry in the level's table and trilinear weight of one of the eight corners."""
     p: tl.constexpr = CORNER // 4
     q: tl.constexpr = CORNER // 2 % 2
@@ -58,7 +58,7 @@ def _corner(low, fraction, resolution, dense, mask, CORNER: tl.constexpr):  # ty
 
 
 @triton.jit(do_not_specialize=["samples"])
-def _encode(points, table, levels, out, samples, mask, L: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+def _encode(points, table, levels, out, samples, mask, L: tl.constexpr, BLOCK: tl.constexpr):
     """One program: a block of samples at one level. An entry's two features are one load of eight bytes."""
     level = tl.program_id(1)
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -73,7 +73,7 @@ def _encode(points, table, levels, out, samples, mask, L: tl.constexpr, BLOCK: t
 
 
 @triton.jit(do_not_specialize=["samples"])
-def _encode_backward(points, grad, levels, table_grad, samples, mask, L: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+def _encode_backward(points, grad, levels, table_grad, samples, mask, L: tl.constexpr, BLOCK: tl.constexpr):
     level = tl.program_id(1)
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = n < samples

@@ -32,7 +32,7 @@ class Box(NamedTuple):
 
 
 @triton.jit
-def _grid(p, CONTRACTED: tl.constexpr):  # type: ignore[no-untyped-def]
+def _grid(p, CONTRACTED: tl.constexpr):
     """Unit coordinates to grid coordinates; see `efficientnerf.geometry.spaces`."""
     if CONTRACTED:
         m = tl.maximum(tl.maximum(tl.abs(p.x), tl.abs(p.y)), tl.maximum(tl.abs(p.z), 1.0))
@@ -44,7 +44,7 @@ def _grid(p, CONTRACTED: tl.constexpr):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _unit_rays(bundle, r, live, box):  # type: ignore[no-untyped-def]
+def _unit_rays(bundle, r, live, box):
     """Origins and directions (Vec3 each) of rays in unit coordinates."""
     origins, directions = bundle.origins, bundle.directions
     ux = (tl.load(origins + r * 3, live, other=0.0) - box.centre.x) / box.half.x
@@ -57,7 +57,7 @@ def _unit_rays(bundle, r, live, box):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _slab(u, v):  # type: ignore[no-untyped-def]
+def _slab(u, v):
     """Distances at which rays cross the faces at -1 and 1 of one axis, nearer first."""
     safe = tl.where(tl.abs(v) < 1e-12, 1e-12, v)
     one, other = (-1 - u) / safe, (1 - u) / safe
@@ -65,7 +65,7 @@ def _slab(u, v):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _clip_to_box(u, v, near, far):  # type: ignore[no-untyped-def]
+def _clip_to_box(u, v, near, far):
     """Distances at which rays enter and leave the box, within near and far."""
     ax, bx = _slab(u.x, v.x)
     ay, by = _slab(u.y, v.y)
@@ -74,7 +74,7 @@ def _clip_to_box(u, v, near, far):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _voxel_of(g, side):  # type: ignore[no-untyped-def]
+def _voxel_of(g, side):
     """Flat index of the density voxel at grid coordinates. Clamped before they become integers: lanes whose ray has ended may be anywhere."""
     i = tl.minimum(tl.maximum(g.x * side, 0.0), side - 1.0).to(tl.int32)
     j = tl.minimum(tl.maximum(g.y * side, 0.0), side - 1.0).to(tl.int32)
@@ -83,7 +83,7 @@ def _voxel_of(g, side):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _store(buffers, at, t, size, length, point, live):  # type: ignore[no-untyped-def]
+def _store(buffers, at, t, size, length, point, live):
     """Samples to their places."""
     tl.store(buffers.start + at, t, live)
     tl.store(buffers.extent + at, size, live)
@@ -92,7 +92,7 @@ def _store(buffers, at, t, size, length, point, live):  # type: ignore[no-untype
 
 
 @triton.jit(do_not_specialize=["rays", "unpruned"])
-def _march(  # type: ignore[no-untyped-def]
+def _march(
     bundle, box, voxels, first, tallies, out, rays, max_intervals, step, threshold, unpruned, side,
     CONTRACTED: tl.constexpr, WRITE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -184,7 +184,7 @@ def valid_samples(
 
 
 @triton.jit
-def _ray_of(first, n, rays, bits):  # type: ignore[no-untyped-def]
+def _ray_of(first, n, rays, bits):
     """Which ray owns packed sample n: the last one that begins at or before it; `rays` has so many bits."""
     low = n * 0
     high = low + rays - 1
@@ -197,7 +197,7 @@ def _ray_of(first, n, rays, bits):  # type: ignore[no-untyped-def]
 
 
 @triton.jit(do_not_specialize=["rays", "samples", "bits"])
-def _pivots(weight, first, out, rays, samples, threshold, max_pivots, bits, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+def _pivots(weight, first, out, rays, samples, threshold, max_pivots, bits, BLOCK: tl.constexpr):
     """Each lane counts the heavier samples of its ray; among equals the nearer counts as heavier."""
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = n < samples
@@ -230,7 +230,7 @@ def select_pivots(weight: Tensor, first: Tensor, threshold: float, max_pivots: i
 
 
 @triton.jit(do_not_specialize=["rays", "samples", "capacity", "per_pivot", "bits"])
-def _pivotal(  # type: ignore[no-untyped-def]
+def _pivotal(
     bundle, box, first, coarse, pivotal, before, fine, rays, samples, capacity, per_pivot, bits, CONTRACTED: tl.constexpr, BLOCK: tl.constexpr
 ):
     """Divides the pivotal ones of the samples `coarse`, SampleColumns, into `fine`; before: pivotal samples before each."""

@@ -128,7 +128,7 @@ class Absorption(NamedTuple):
 
 
 @triton.jit
-def _thickness(index, density, sample, voxel, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
+def _thickness(index, density, sample, voxel, BRICK: tl.constexpr, NEAREST: tl.constexpr):
     """Optical thickness of samples over a step."""
     sigma = tl.zeros_like(sample.fraction.x)
     for n in tl.static_range(1 if NEAREST else 8):
@@ -138,7 +138,7 @@ def _thickness(index, density, sample, voxel, BRICK: tl.constexpr, NEAREST: tl.c
 
 
 @triton.jit
-def _shaded(scene, sample, transmittance, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr):  # type: ignore[no-untyped-def]
+def _shaded(scene, sample, transmittance, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr):
     """Of samples: whether they show, weight where they do, colour (Vec3), transmittance behind them, and the sum of the corners' weights."""
     thickness = _thickness(scene.index, scene.density, sample, scene.voxel, BRICK, NEAREST)
     after = transmittance * tl.exp(-thickness)
@@ -149,7 +149,7 @@ def _shaded(scene, sample, transmittance, BRICK: tl.constexpr, NEAREST: tl.const
 
 
 @triton.jit
-def _rays(rays, count, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+def _rays(rays, count, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr):
     """This program's rays: numbers, which of them exist, origins, directions, and harmonics of each column of a row (BLOCK, ROW)."""
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = r < count
@@ -158,13 +158,13 @@ def _rays(rays, count, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr):
 
 
 @triton.jit
-def _composite(scene, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr):  # type: ignore[no-untyped-def]
+def _composite(scene, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr):
     _, weight, rgb, after, _ = _shaded(scene, sample, state.transmittance, BRICK, NEAREST, K)
     return Forward(after, add_scaled(state.colour, weight, rgb))
 
 
 @triton.jit(do_not_specialize=["count"])
-def _forward(  # type: ignore[no-untyped-def]
+def _forward(
     rays, cascades, voxels, colour, transmittance, count,
     NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -178,7 +178,7 @@ def _forward(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def by_sample(by, behind, weight, rgb, after):  # type: ignore[no-untyped-def]
+def by_sample(by, behind, weight, rgb, after):
     """Of samples, front to back: colour behind them (Vec3), gradients by their optical thickness, and by the arguments of the sigmoids (Vec3)."""
     rest = Vec3(behind.x - weight * rgb.x, behind.y - weight * rgb.y, behind.z - weight * rgb.z)
     g = by.colour
@@ -187,7 +187,7 @@ def by_sample(by, behind, weight, rgb, after):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _add_gradients(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr):  # type: ignore[no-untyped-def]
+def _add_gradients(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr):
     """given  Scene, Upstream and Sums"""
     scene, by, sums = given[0], given[1], given[2]
     column, channel = scene.column, scene.column % 3
@@ -207,7 +207,7 @@ def _add_gradients(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.conste
 
 
 @triton.jit(do_not_specialize=["count", "number"])
-def _backward(  # type: ignore[no-untyped-def]
+def _backward(
     rays, cascades, voxels, outputs, gradients, sums, stamp, count, number, scale,
     NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -228,7 +228,7 @@ def _backward(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _raise_maximum(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr):  # type: ignore[no-untyped-def]
+def _raise_maximum(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr):
     """given  index, density, voxel as in a Scene; transmittance at which rays reach the grid; the buffer that is raised (N,)"""
     index, density, voxel, arriving, maximum = given[0], given[1], given[2], given[3], given[4]
     after = state.transmittance * tl.exp(-_thickness(index, density, sample, voxel, BRICK, NEAREST))
@@ -240,7 +240,7 @@ def _raise_maximum(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.conste
 
 
 @triton.jit(do_not_specialize=["count"])
-def _max_contributions(  # type: ignore[no-untyped-def]
+def _max_contributions(
     rays, cascades, index, density, transmittance, maximum, count, voxel,
     NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip

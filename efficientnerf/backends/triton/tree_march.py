@@ -74,7 +74,7 @@ class Sample(NamedTuple):
 
 
 @triton.jit
-def _slab(o, d, high):  # type: ignore[no-untyped-def]
+def _slab(o, d, high):
     """Along one axis: 1 / d, and the distances at which a ray enters and leaves 0 to `high`; never, where it is parallel and outside."""
     parallel = d == 0
     inverse = tl.where(parallel, 1e30, 1 / tl.where(parallel, 1.0, d))
@@ -84,7 +84,7 @@ def _slab(o, d, high):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def ray_in_grid(grid, origin, direction, unit, step, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
+def ray_in_grid(grid, origin, direction, unit, step, BRICK: tl.constexpr):
     """A Ray from its origin and direction, voxel coordinates."""
     ix, ax, bx = _slab(origin.x, direction.x, grid.shape.x * BRICK)
     iy, ay, by = _slab(origin.y, direction.y, grid.shape.y * BRICK)
@@ -96,30 +96,30 @@ def ray_in_grid(grid, origin, direction, unit, step, BRICK: tl.constexpr):  # ty
 
 
 @triton.jit
-def _cell_of(u, cells, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
+def _cell_of(u, cells, BRICK: tl.constexpr):
     """Coarse cell of a voxel coordinate, clamped to the grid."""
     return (tl.minimum(tl.maximum(u, 0.0), cells * BRICK - 0.5) / BRICK).to(tl.int32)
 
 
 @triton.jit
-def _cells_of(grid, point, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
+def _cells_of(grid, point, BRICK: tl.constexpr):
     return Vec3(_cell_of(point.x, grid.shape.x, BRICK), _cell_of(point.y, grid.shape.y, BRICK), _cell_of(point.z, grid.shape.z, BRICK))
 
 
 @triton.jit
-def _owner(grid, cell, live):  # type: ignore[no-untyped-def]
+def _owner(grid, cell, live):
     return tl.load(grid.owner + (cell.x.to(tl.int64) * grid.shape.y + cell.y) * grid.shape.z + cell.z, live, other=-1)
 
 
 @triton.jit
-def _cube_exit(o, d, inverse, cell, radius, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
+def _cube_exit(o, d, inverse, cell, radius, BRICK: tl.constexpr):
     """Distance at which a ray leaves the empty cube of `radius` cells around its own, along one axis."""
     face = tl.where(d > 0, cell + radius, cell - radius + 1) * BRICK
     return tl.where(d == 0, 1e30, (face - o) * inverse)
 
 
 @triton.jit
-def _first_corner(u, cell, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
+def _first_corner(u, cell, BRICK: tl.constexpr, NEAREST: tl.constexpr):
     """Along one axis: the lower corner of a point in the brick of `cell` with its border, and the fraction from there to the next corner."""
     if NEAREST:
         i = tl.minimum(tl.maximum(tl.floor(u) - cell * BRICK, 0.0), BRICK - 1.0)
@@ -132,7 +132,7 @@ def _first_corner(u, cell, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type:
 
 
 @triton.jit
-def _place_in_brick(point, cell, brick, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
+def _place_in_brick(point, cell, brick, BRICK: tl.constexpr, NEAREST: tl.constexpr):
     """`corner` and `fraction` of a Sample."""
     EDGE: tl.constexpr = BRICK + 2
     i, fx = _first_corner(point.x, cell.x, BRICK, NEAREST)
@@ -142,7 +142,7 @@ def _place_in_brick(point, cell, brick, BRICK: tl.constexpr, NEAREST: tl.constex
 
 
 @triton.jit
-def _sample(grid, ray, k, alive, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
+def _sample(grid, ray, k, alive, BRICK: tl.constexpr, NEAREST: tl.constexpr):
     """The `k`-th Sample of rays, and the number of the next one."""
     t = ray.enter + (k.to(tl.float32) + 0.5) * ray.step
     point = along(ray.origin, ray.direction, t)
@@ -158,13 +158,13 @@ def _sample(grid, ray, k, alive, BRICK: tl.constexpr, NEAREST: tl.constexpr):  #
 
 
 @triton.jit
-def _in_grid(ray, k):  # type: ignore[no-untyped-def]
+def _in_grid(ray, k):
     """Whether sample `k` lies in the grid."""
     return ray.enter + (k.to(tl.float32) + 0.5) * ray.step < ray.leave
 
 
 @triton.jit
-def march(  # type: ignore[no-untyped-def]
+def march(
     grid, ray, live, scene, state, VISIT: tl.constexpr, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr
 ):
     """Calls VISIT for the samples of rays that lie in bricks, front to back, until each ray is opaque or leaves the grid; returns the last state.
@@ -184,7 +184,7 @@ def march(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def cascade_grid(cascades, n):  # type: ignore[no-untyped-def]
+def cascade_grid(cascades, n):
     """The Grid of cascade n, its corner (Vec3) and the side of its voxels, voxels of cascade 0."""
     shape, place = cascades.shapes + 3 * n, cascades.place + 4 * n
     grid = Grid(cascades.owner + tl.load(cascades.first + n), Vec3(tl.load(shape), tl.load(shape + 1), tl.load(shape + 2)))
@@ -192,20 +192,20 @@ def cascade_grid(cascades, n):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def in_cascade(point, corner, unit):  # type: ignore[no-untyped-def]
+def in_cascade(point, corner, unit):
     """Points of cascade 0's voxel coordinates in those of a cascade."""
     return Vec3((point.x - corner.x) / unit, (point.y - corner.y) / unit, (point.z - corner.z) / unit)
 
 
 @triton.jit
-def _ray_in_cascade(cascades, n, origin, direction, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
+def _ray_in_cascade(cascades, n, origin, direction, BRICK: tl.constexpr):
     """The Grid of cascade n and rays in it."""
     grid, corner, unit = cascade_grid(cascades, n)
     return grid, ray_in_grid(grid, in_cascade(origin, corner, unit), direction, unit, cascades.step, BRICK)
 
 
 @triton.jit
-def march_cascades(  # type: ignore[no-untyped-def]
+def march_cascades(
     cascades, origin, direction, live, scene, state, VISIT: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, NEAREST: tl.constexpr,
     K: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
@@ -228,7 +228,7 @@ def march_cascades(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def corner_weight(fraction, CORNER: tl.constexpr):  # type: ignore[no-untyped-def]
+def corner_weight(fraction, CORNER: tl.constexpr):
     """Trilinear weight of a corner, numbered with z fastest."""
     p: tl.constexpr = CORNER // 4
     q: tl.constexpr = CORNER // 2 % 2
@@ -237,14 +237,14 @@ def corner_weight(fraction, CORNER: tl.constexpr):  # type: ignore[no-untyped-de
 
 
 @triton.jit
-def corner_place(corner, CORNER: tl.constexpr, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
+def corner_place(corner, CORNER: tl.constexpr, BRICK: tl.constexpr):
     """Place of a corner in the arrays of bricks with border, from that of the lowest."""
     EDGE: tl.constexpr = BRICK + 2
     return corner + (((CORNER // 4) * EDGE + CORNER // 2 % 2) * EDGE + CORNER % 2)
 
 
 @triton.jit
-def density_at(grid, density, point, live, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
+def density_at(grid, density, point, live, BRICK: tl.constexpr, NEAREST: tl.constexpr):
     """Density at any point: zero outside of the grid and in empty coarse cells."""
     n = grid.shape
     inside = live & (point.x >= 0) & (point.y >= 0) & (point.z >= 0) & (point.x < n.x * BRICK) & (point.y < n.y * BRICK) & (point.z < n.z * BRICK)
@@ -255,7 +255,7 @@ def density_at(grid, density, point, live, BRICK: tl.constexpr, NEAREST: tl.cons
 
 
 @triton.jit
-def interpolate_density(density, corner, fraction, live, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
+def interpolate_density(density, corner, fraction, live, BRICK: tl.constexpr, NEAREST: tl.constexpr):
     """Density from values of bricks with border."""
     total = tl.zeros_like(fraction.x)
     for n in tl.static_range(1 if NEAREST else 8):
@@ -264,7 +264,7 @@ def interpolate_density(density, corner, fraction, live, BRICK: tl.constexpr, NE
 
 
 @triton.jit
-def interpolate_harmonics(index, sh, sample, live, column, WIDTH: tl.constexpr, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
+def interpolate_harmonics(index, sh, sample, live, column, WIDTH: tl.constexpr, BRICK: tl.constexpr, NEAREST: tl.constexpr):
     """Coefficients (R, C) of samples summed over the stored corners by their weights, and the sum of these weights (R,), which is positive.
 
     sh  rows of WIDTH coefficients; columns beyond it are zero
@@ -281,7 +281,7 @@ def interpolate_harmonics(index, sh, sample, live, column, WIDTH: tl.constexpr, 
 
 
 @triton.jit
-def colour_of(mixed, total, basis, channel):  # type: ignore[no-untyped-def]
+def colour_of(mixed, total, basis, channel):
     """Colours of samples (Vec3) from `interpolate_harmonics`; `channel` (C,) of each column, 0 to 2."""
     terms = mixed * basis
     red = sigmoid(tl.sum(tl.where((channel == 0)[None, :], terms, 0.0), 1) / total)

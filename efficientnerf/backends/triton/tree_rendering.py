@@ -71,7 +71,7 @@ class State(NamedTuple):
 
 
 @triton.jit
-def _pixel_rays(camera, width, height, WIDE: tl.constexpr, HIGH: tl.constexpr):  # type: ignore[no-untyped-def]
+def _pixel_rays(camera, width, height, WIDE: tl.constexpr, HIGH: tl.constexpr):
     """This program's tile of a pinhole camera's image: pixels, which of them exist, origins, directions, and the cosines of their angles to the axis."""
     lane = tl.arange(0, WIDE * HIGH)
     across = (width + WIDE - 1) // WIDE
@@ -87,7 +87,7 @@ def _pixel_rays(camera, width, height, WIDE: tl.constexpr, HIGH: tl.constexpr): 
 
 
 @triton.jit
-def _composite(scene, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr):  # type: ignore[no-untyped-def]
+def _composite(scene, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr):
     """Add a sample to the State of its rays."""
     sigma = interpolate_density(scene.density, sample.corner, sample.fraction, sample.inside, BRICK, NEAREST)
     alpha = 1 - tl.exp(-sigma * (sample.step * scene.voxel * sample.unit))
@@ -106,7 +106,7 @@ def _composite(scene, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr,
 
 
 @triton.jit
-def _normal(grid, density, p, live, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
+def _normal(grid, density, p, live, BRICK: tl.constexpr, NEAREST: tl.constexpr):
     """Unit vectors down the density's gradient at points, by central differences of one voxel; zero where it is flat."""
     gx, gy, gz = tl.zeros_like(p.x), tl.zeros_like(p.x), tl.zeros_like(p.x)
     for face in range(6):  # in a loop: six copies of it take the compiler seconds
@@ -120,7 +120,7 @@ def _normal(grid, density, p, live, BRICK: tl.constexpr, NEAREST: tl.constexpr):
 
 
 @triton.jit
-def _surface_normal(cascades, density, p, live, CASCADES: tl.constexpr, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
+def _surface_normal(cascades, density, p, live, CASCADES: tl.constexpr, BRICK: tl.constexpr, NEAREST: tl.constexpr):
     """`_normal` in the cascades that points belong to."""
     if CASCADES == 1:
         facing = _normal(Grid(cascades.owner, cascades.shape), density, p, live, BRICK, NEAREST)
@@ -137,7 +137,7 @@ def _surface_normal(cascades, density, p, live, CASCADES: tl.constexpr, BRICK: t
 
 
 @triton.jit(do_not_specialize=["count", "width", "height"])
-def render(  # type: ignore[no-untyped-def]
+def render(
     rays, cascades, voxels, out, count, width, height, camera, background,
     PINHOLE: tl.constexpr, OVER: tl.constexpr, NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr,
     ROW: tl.constexpr, WIDE: tl.constexpr, HIGH: tl.constexpr,

@@ -44,7 +44,7 @@ class Rule(NamedTuple):
 
 
 @triton.jit
-def _total_variation(v, met, thickness, side, weight, before, beside, least):  # type: ignore[no-untyped-def]
+def _total_variation(v, met, thickness, side, weight, before, beside, least):
     """Share `weight` of the differences of the logarithm of the optical thickness to those of the neighbours."""
     here, slope = tl.log(thickness), tl.zeros_like(thickness)
     for face in tl.static_range(6):
@@ -55,7 +55,7 @@ def _total_variation(v, met, thickness, side, weight, before, beside, least):  #
 
 
 @triton.jit(do_not_specialize=["number"])
-def _step(  # type: ignore[no-untyped-def]
+def _step(
     values, sums, moments, neighbours, stamp, cascade_of, place, voxels, number, unit, rule,
     CASCADES: tl.constexpr, SMOOTH: tl.constexpr, WIDTH: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip

@@ -13,7 +13,7 @@ from efficientnerf.backends.numba.runtime import PRANGE, numba
 
 
 @numba.njit(cache=True, error_model="numpy")
-def count_codes(codes, neighbours, beside, counts, begin, end):  # type: ignore[no-untyped-def]
+def count_codes(codes, neighbours, beside, counts, begin, end):
     """Add the symbols of one group's codes (N,) uint8 to counts (272, 256) int64 of their contexts; `beside` as in `choose_codes`."""
     for n in range(begin, end):
         count, p, q, r = near_voxels(neighbours, n)
@@ -28,7 +28,7 @@ def count_codes(codes, neighbours, beside, counts, begin, end):  # type: ignore[
 
 
 @numba.njit(inline="always")
-def _error(vectors, palette, n, p):  # type: ignore[no-untyped-def]
+def _error(vectors, palette, n, p):
     total = np.float32(0)
     for d in range(vectors.shape[1]):
         difference = vectors[n, d] - palette[p, d]
@@ -37,7 +37,7 @@ def _error(vectors, palette, n, p):  # type: ignore[no-untyped-def]
 
 
 @numba.njit
-def _choose_codes(vectors, weight, palette, neighbours, beside, repeat_bits, code_bits, least_bits, codes, begin, end):  # type: ignore[no-untyped-def]
+def _choose_codes(vectors, weight, palette, neighbours, beside, repeat_bits, code_bits, least_bits, codes, begin, end):
     for n in range(begin, end):
         count, p, q, r = near_voxels(neighbours, n)
         known_a, known_c = np.int64(codes[p]), np.int64(codes[r])
@@ -60,7 +60,7 @@ def _choose_codes(vectors, weight, palette, neighbours, beside, repeat_bits, cod
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def choose_codes(vectors, weight, palette, neighbours, beside, repeat_bits, code_bits, least_bits, codes, first, begin, end):  # type: ignore[no-untyped-def]
+def choose_codes(vectors, weight, palette, neighbours, beside, repeat_bits, code_bits, least_bits, codes, first, begin, end):
     """Codes (N,) uint8 of one group. A palette is searched only where its cheapest entry, were it exact, would be better than a neighbour's.
 
     vectors      (N, D) float32; palette (P, D)
@@ -76,7 +76,7 @@ def choose_codes(vectors, weight, palette, neighbours, beside, repeat_bits, code
 
 
 @numba.njit
-def _choose_bases(values, weight, table, neighbours, bits, codes, channel, begin, end):  # type: ignore[no-untyped-def]
+def _choose_bases(values, weight, table, neighbours, bits, codes, channel, begin, end):
     for n in range(begin, end):
         predicted, context = base_prediction(codes, neighbours, np.int64(table.shape[0]), n, channel)
         nearest = np.int64(codes[3 * n + channel])
@@ -90,7 +90,7 @@ def _choose_bases(values, weight, table, neighbours, bits, codes, channel, begin
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def choose_bases(values, weight, table, neighbours, bits, codes, channel, first, begin, end):  # type: ignore[no-untyped-def]
+def choose_bases(values, weight, table, neighbours, bits, codes, channel, first, begin, end):
     """Codes (3 N,) uint8 of one channel, of those between the nearest one, which is there before, and the one that is predicted.
 
     values  (N, 3) float32; weight (N, 3); table (T, 3)
@@ -101,7 +101,7 @@ def choose_bases(values, weight, table, neighbours, bits, codes, channel, first,
 
 
 @numba.njit
-def _choose_densities(opacity, weight, table, neighbours, bits, codes, begin, end):  # type: ignore[no-untyped-def]
+def _choose_densities(opacity, weight, table, neighbours, bits, codes, begin, end):
     entries = table.shape[0]
     for n in range(begin, end):
         context = density_context(codes, neighbours, n, entries)
@@ -115,7 +115,7 @@ def _choose_densities(opacity, weight, table, neighbours, bits, codes, begin, en
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def choose_densities(opacity, weight, table, neighbours, bits, codes, first, begin, end):  # type: ignore[no-untyped-def]
+def choose_densities(opacity, weight, table, neighbours, bits, codes, first, begin, end):
     """Codes (N,) uint8.
 
     opacity  (N,) float32 of the voxels; table (T,) float32 of the entries

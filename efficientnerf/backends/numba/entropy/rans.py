@@ -64,7 +64,7 @@ def digits(typing_context: Any, value: Any) -> Any:
 
 
 @numba.njit(inline="always")
-def slice_of(coder, s):  # type: ignore[no-untyped-def]
+def slice_of(coder, s):
     reads, state, _, end, _, words, table, symbol, shares, symbols, contexts = coder
     return Slice(
         reads, end[s], advanced(pointer(state), s * state.shape[1]), pointer(words), pointer(table), pointer(symbol), pointer(shares), pointer(symbols),
@@ -73,7 +73,7 @@ def slice_of(coder, s):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def _refilled(one, lane, x, at):  # type: ignore[no-untyped-def]
+def _refilled(one, lane, x, at):
     """Keep the state of a lane, with a word more if it is low: where the next word is, and 1 if there was none."""
     low = np.int64(x < LOWEST)
     there = low & np.int64(at < one.end)
@@ -83,7 +83,7 @@ def _refilled(one, lane, x, at):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def coded(one, lane, context, value, at):  # type: ignore[no-untyped-def]
+def coded(one, lane, context, value, at):
     """The next symbol of a slice, read, or `value`, which is recorded; where it goes on; and 1 if words ran out.
 
     lane  whose state it is; the same for all symbols of a context
@@ -103,7 +103,7 @@ def coded(one, lane, context, value, at):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def coded_bit(one, lane, context, value, at):  # type: ignore[no-untyped-def]
+def coded_bit(one, lane, context, value, at):
     """As `coded`, of a context whose tables have the symbols 0 and 1 alone: what slots stand for is not looked up."""
     if not one.reads:
         one.symbols[at] = value
@@ -119,7 +119,7 @@ def coded_bit(one, lane, context, value, at):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def coded_few(one, lane, context, value, at):  # type: ignore[no-untyped-def]
+def coded_few(one, lane, context, value, at):
     """As `coded_bit`, of the symbols 0 to 3."""
     if not one.reads:
         one.symbols[at] = value
@@ -136,7 +136,7 @@ def coded_few(one, lane, context, value, at):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def fill_slots(frequency, shares, symbol):  # type: ignore[no-untyped-def]
+def fill_slots(frequency, shares, symbol):
     """`shares` and `symbol` of a coder whose frequencies (T, 256) have the sum SLOTS in each table."""
     for t in range(frequency.shape[0]):
         reached = np.int64(0)
@@ -148,7 +148,7 @@ def fill_slots(frequency, shares, symbol):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def encode(symbols, contexts, lanes, table, shares, words, begin, end, at, state, done, most):  # type: ignore[no-untyped-def]
+def encode(symbols, contexts, lanes, table, shares, words, begin, end, at, state, done, most):
     """Encode `most` symbols of each slice that are left, the last first, after `done` before; words are written from the end towards the beginning.
 
     lanes       (n,) uint8, of each context
@@ -172,14 +172,14 @@ def encode(symbols, contexts, lanes, table, shares, words, begin, end, at, state
 
 
 @numba.njit(cache=True, error_model="numpy")
-def count_symbols(symbols, contexts, counts):  # type: ignore[no-untyped-def]
+def count_symbols(symbols, contexts, counts):
     """Add each symbol to counts (n, 256) int64 of its context."""
     for n in range(symbols.shape[0]):
         counts[contexts[n], symbols[n]] += 1
 
 
 @numba.njit(inline="always")
-def _cost(counts):  # type: ignore[no-untyped-def]
+def _cost(counts):
     """Bits of symbols of these counts (256,), and of their table."""
     total, bits = 0.0, 0.0
     for s in range(256):
@@ -191,7 +191,7 @@ def _cost(counts):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def merge_contexts(counts, most):  # type: ignore[no-untyped-def]
+def merge_contexts(counts, most):
     """Which contexts share a table: (n,) int64, the least context of each table. Pairs whose union costs least are joined until it costs more than it saves
     and at most `most` tables are left.
 

@@ -20,7 +20,7 @@ NEW = 3  # symbol: the code of no neighbour
 
 
 @numba.njit(cache=True, error_model="numpy")
-def walk_cells(coder, cells, begin, end):  # type: ignore[no-untyped-def]
+def walk_cells(coder, cells, begin, end):
     """Planes `begin` to `end` of a grid along x, in a stream of one slice.
 
     cells  (X + 1, Y + 1, Z + 1) uint8, 1 where one is occupied; the first plane, row and column are 0
@@ -40,7 +40,7 @@ def walk_cells(coder, cells, begin, end):  # type: ignore[no-untyped-def]
 
 
 @numba.njit
-def _walk_masks(coder, s, stored, before, border, inner, b, begin, end):  # type: ignore[no-untyped-def]
+def _walk_masks(coder, s, stored, before, border, inner, b, begin, end):
     one, at, failed = slice_of(coder, s), coder.at[s], coder.failed[s]
     cube, side, plane = stored.shape[1], b + 1, (b + 1) * (b + 1)
     room = np.zeros(side * plane, np.uint8)
@@ -63,7 +63,7 @@ def _walk_masks(coder, s, stored, before, border, inner, b, begin, end):  # type
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def walk_masks(coder, stored, before, border, inner, b, first, begin, end):  # type: ignore[no-untyped-def]
+def walk_masks(coder, stored, before, border, inner, b, first, begin, end):
     """Voxels of bricks.
 
     stored  (B, b^3) uint8, 1 where a voxel is
@@ -77,12 +77,12 @@ def walk_masks(coder, stored, before, border, inner, b, first, begin, end):  # t
 
 
 @numba.njit(inline="always")
-def _slot(p, q, r, b):  # type: ignore[no-untyped-def]
+def _slot(p, q, r, b):
     return (p * b + q) * b + r
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def find_neighbours(index, before, b, neighbours, begin, end):  # type: ignore[no-untyped-def]
+def find_neighbours(index, before, b, neighbours, begin, end):
     """Voxels one step back along x, y and z from those of bricks `begin` to `end`: neighbours (N, 3) int32, -1 where none is stored.
 
     index  (B, b^3) int32: numbers of the stored voxels
@@ -103,7 +103,7 @@ def find_neighbours(index, before, b, neighbours, begin, end):  # type: ignore[n
 
 
 @numba.njit(inline="always")
-def near_voxels(neighbours, n):  # type: ignore[no-untyped-def]
+def near_voxels(neighbours, n):
     """How many neighbours voxel n has, and which, those that are there first; the first of them stands for those that are not, and n itself for none."""
     i, j, k = np.int64(neighbours[3 * n]), np.int64(neighbours[3 * n + 1]), np.int64(neighbours[3 * n + 2])
     x, y, z = i >= 0, j >= 0, k >= 0
@@ -114,26 +114,26 @@ def near_voxels(neighbours, n):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def _mean(total, count):  # type: ignore[no-untyped-def]
+def _mean(total, count):
     """Sums below 2^16 of 0 to 3 values, divided by how many and rounded down; 0 of none."""
     return (total * (131072 if count == 1 else 65536 if count == 2 else 43691 if count == 3 else 0)) >> 17
 
 
 @numba.njit(inline="always")
-def _sum(count, a, b, c):  # type: ignore[no-untyped-def]
+def _sum(count, a, b, c):
     """Of the values that are there."""
     return a * np.int64(count > 0) + b * np.int64(count > 1) + c * np.int64(count > 2)
 
 
 @numba.njit(inline="always")
-def density_context(codes, neighbours, n, entries):  # type: ignore[no-untyped-def]
+def density_context(codes, neighbours, n, entries):
     count, p, q, r = near_voxels(neighbours, n)
     mean = _mean(_sum(count, np.int64(codes[p]), np.int64(codes[q]), np.int64(codes[r])), count)
     return np.int64(count > 0) * (1 + min(32 * mean // entries, 31))
 
 
 @numba.njit
-def _walk_densities(coder, s, codes, neighbours, entries, begin, end):  # type: ignore[no-untyped-def]
+def _walk_densities(coder, s, codes, neighbours, entries, begin, end):
     one, at, failed = slice_of(coder, s), coder.at[s], coder.failed[s]
     values, near, length = pointer(codes), pointer(neighbours), np.uint32(entries)
     for n in range(begin, end):
@@ -144,7 +144,7 @@ def _walk_densities(coder, s, codes, neighbours, entries, begin, end):  # type: 
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def walk_densities(coder, codes, neighbours, entries, first, begin, end):  # type: ignore[no-untyped-def]
+def walk_densities(coder, codes, neighbours, entries, first, begin, end):
     """Codes (N,) uint8 into a table of so many entries.
 
     first  (S + 1,) int64: voxels of the slices
@@ -154,7 +154,7 @@ def walk_densities(coder, codes, neighbours, entries, first, begin, end):  # typ
 
 
 @numba.njit(inline="always")
-def _predicted(codes, count, p, q, r, channel):  # type: ignore[no-untyped-def]
+def _predicted(codes, count, p, q, r, channel):
     """Mean of the neighbours' codes, and the class of how far they lie apart: 0 without neighbours, else 1 to 7."""
     a, b, c = np.int64(codes[3 * p + channel]), np.int64(codes[3 * q + channel]), np.int64(codes[3 * r + channel])
     apart = max(a, b, c) - min(a, b, c)
@@ -162,7 +162,7 @@ def _predicted(codes, count, p, q, r, channel):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def base_prediction(codes, neighbours, entries, n, channel):  # type: ignore[no-untyped-def]
+def base_prediction(codes, neighbours, entries, n, channel):
     """What a voxel's code of a channel is predicted to be, and its context. Green (1) comes first; how far it is from its prediction corrects the others."""
     count, p, q, r = near_voxels(neighbours, n)
     predicted, spread = _predicted(codes, count, p, q, r, channel)
@@ -174,7 +174,7 @@ def base_prediction(codes, neighbours, entries, n, channel):  # type: ignore[no-
 
 
 @numba.njit
-def _walk_bases(coder, s, codes, neighbours, entries, begin, end):  # type: ignore[no-untyped-def]
+def _walk_bases(coder, s, codes, neighbours, entries, begin, end):
     one, at, failed = slice_of(coder, s), coder.at[s], coder.failed[s]
     values, near = pointer(codes), pointer(neighbours)
     for n in range(begin, end):
@@ -194,7 +194,7 @@ def _walk_bases(coder, s, codes, neighbours, entries, begin, end):  # type: igno
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def walk_bases(coder, codes, neighbours, entries, first, begin, end):  # type: ignore[no-untyped-def]
+def walk_bases(coder, codes, neighbours, entries, first, begin, end):
     """Codes (N, 3) uint8: of each voxel green, then red, then blue, each of which has a lane.
 
     first  (S + 1,) int64: voxels of the slices
@@ -204,7 +204,7 @@ def walk_bases(coder, codes, neighbours, entries, first, begin, end):  # type: i
 
 
 @numba.njit(inline="always")
-def known_codes(count, a, b, c, shift):  # type: ignore[no-untyped-def]
+def known_codes(count, a, b, c, shift):
     """Of the codes of the neighbours that are there: how many are different, the second of these, in which of seven ways they agree, and the class of their
     leading bytes' lengths."""
     apart = np.int64(b != a)
@@ -215,13 +215,13 @@ def known_codes(count, a, b, c, shift):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def newness(leading):  # type: ignore[no-untyped-def]
+def newness(leading):
     """Class of a code that is none of its neighbours', 1 to 3."""
     return 1 + np.int64(leading >= 8) + np.int64(leading >= 64)
 
 
 @numba.njit
-def _walk_codes(coder, s, codes, neighbours, densities, quarters, shift, begin, end):  # type: ignore[no-untyped-def]
+def _walk_codes(coder, s, codes, neighbours, densities, quarters, shift, begin, end):
     one, at, failed = slice_of(coder, s), coder.at[s], coder.failed[s]
     groups = codes.shape[1]
     each = REPEAT_CONTEXTS + CODE_CONTEXTS + (LOW_CONTEXTS if shift else 0)
@@ -257,7 +257,7 @@ def _walk_codes(coder, s, codes, neighbours, densities, quarters, shift, begin, 
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def walk_codes(coder, codes, neighbours, densities, quarters, shift, first, begin, end):  # type: ignore[no-untyped-def]
+def walk_codes(coder, codes, neighbours, densities, quarters, shift, first, begin, end):
     """Codes (N, G) of the groups of each voxel, each of which has a lane: whether one is that of a neighbour, and which if not.
 
     densities  (N,) uint8 codes; quarters (256,) uint8: the quarter of the table that each lies in

@@ -9,7 +9,7 @@ INSIDE = 1e-3  # barycentric coordinate from which a sample is inside a face, no
 
 
 @numba.njit(cache=True, error_model="numpy")
-def grow(order, beside, normals, smooth, areas, least, limit, first, charts):  # type: ignore[no-untyped-def]
+def grow(order, beside, normals, smooth, areas, least, limit, first, charts):
     """Grows charts from seeds over neighbouring faces, the nearest faces first.
 
     order    (N,) int64 faces that may be seeds, in this order; those that have a chart are passed by
@@ -58,7 +58,7 @@ def grow(order, beside, normals, smooth, areas, least, limit, first, charts):  #
 
 
 @numba.njit(cache=True, error_model="numpy")
-def best_turns(places, begin, turns):  # type: ignore[no-untyped-def]
+def best_turns(places, begin, turns):
     """(C,) of `turns` rotations of a quarter circle that one in which each chart's box is smallest.
 
     places  (N, 2) float64 of the charts' corners, chart after chart
@@ -82,7 +82,7 @@ def best_turns(places, begin, turns):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def overlapping(corners, begin, sizes, out):  # type: ignore[no-untyped-def]
+def overlapping(corners, begin, sizes, out):
     """Marks faces of charts that lie over a face before them in the same chart, at the centres of a grid of unit squares.
 
     corners  (N, 3, 2) float64 of the faces, chart after chart; each chart's lie within its size
@@ -118,7 +118,7 @@ def overlapping(corners, begin, sizes, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def profiles(corners, begin, first, gap, bottom, top):  # type: ignore[no-untyped-def]
+def profiles(corners, begin, first, gap, bottom, top):
     """Lower and upper ends of charts over columns of texels, with a gap around them.
 
     corners      (N, 3, 2) float64 texels, of the faces chart after chart, from (gap, gap) on
@@ -137,7 +137,7 @@ def profiles(corners, begin, first, gap, bottom, top):  # type: ignore[no-untype
 
 
 @numba.njit(cache=True, error_model="numpy")
-def pack(order, first, bottom, top, step, horizon, places):  # type: ignore[no-untyped-def]
+def pack(order, first, bottom, top, step, horizon, places):
     """Puts charts into a square from below, each where its upper end is lowest; True if all fit.
 
     order        (N,) int64 in which they are placed
@@ -174,7 +174,7 @@ def pack(order, first, bottom, top, step, horizon, places):  # type: ignore[no-u
 
 
 @numba.njit(cache=True, error_model="numpy")
-def lay_faces(corners, begin, end, owner):  # type: ignore[no-untyped-def]
+def lay_faces(corners, begin, end, owner):
     """Which of the faces `begin` to `end` each texel's centre lies in, the first of several.
 
     corners  (F, 3, 2) float64 texels, y down, counter-clockwise or not
@@ -197,7 +197,7 @@ def lay_faces(corners, begin, end, owner):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def spread(begin, end, step, source, distance):  # type: ignore[no-untyped-def]
+def spread(begin, end, step, source, distance):
     """Carries the nearest source on over rows `begin` to `end`, in the direction of `step`: downwards and to the right (1), or back (-1).
 
     source    (S, S) int32 a texel that each texel is to be like, -1 where there is none yet

@@ -17,7 +17,7 @@ STEEPEST = 0.15  # cosine between a surface's normal and a ray, below which the 
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _slope(before, here, after):  # type: ignore[no-untyped-def]
+def _slope(before, here, after):
     """The gentler of two one-sided differences; values of zero are none."""
     left, right = here - before, after - here
     if before <= 0.0:
@@ -28,7 +28,7 @@ def _slope(before, here, after):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _inverses(depth, opacity, begin, end, radius):  # type: ignore[no-untyped-def]
+def _inverses(depth, opacity, begin, end, radius):
     """Inverse depths (end - begin + 2 radius, W + 2 radius) float64 of rows of an image and what is around them; zero outside of the image and where a pixel
     is not opaque."""
     height, width = depth.shape
@@ -41,7 +41,7 @@ def _inverses(depth, opacity, begin, end, radius):  # type: ignore[no-untyped-de
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _shares(radius):  # type: ignore[no-untyped-def]
+def _shares(radius):
     """What pixels around one count (2 radius + 1, 2 radius + 1), and the sum of that."""
     out, whole = np.empty((2 * radius + 1, 2 * radius + 1)), 0.0
     for dv in range(-radius, radius + 1):
@@ -53,7 +53,7 @@ def _shares(radius):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _plane(inverse, y, x, shares, whole, radius, band, even):  # type: ignore[no-untyped-def]
+def _plane(inverse, y, x, shares, whole, radius, band, even):
     """The plane through a pixel and those around it that lie within `band` of it, by weighted least squares: w, a, b, confidence."""
     w = inverse[y, x]
     a = _slope(inverse[y, x - 1], w, inverse[y, x + 1])
@@ -79,7 +79,7 @@ def _plane(inverse, y, x, shares, whole, radius, band, even):  # type: ignore[no
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def fit_planes(depth, opacity, lens, begin, end, radius, band, even, out):  # type: ignore[no-untyped-def]
+def fit_planes(depth, opacity, lens, begin, end, radius, band, even, out):
     """What each pixel of the rows `begin` to `end` of an image sees.
 
     depth, opacity  (H, W) float32, along the view axis
@@ -113,7 +113,7 @@ def fit_planes(depth, opacity, lens, begin, end, radius, band, even, out):  # ty
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _slope_of_plane(pixel, column, row, m, w, lens):  # type: ignore[no-untyped-def]
+def _slope_of_plane(pixel, column, row, m, w, lens):
     """How fast n . x - 1 of a pixel's plane grows along its normal in the grid's frame, at a point with this W."""
     if m[3, 2] == 0.0:  # the world
         return pixel[LENGTH]
@@ -126,7 +126,7 @@ def _slope_of_plane(pixel, column, row, m, w, lens):  # type: ignore[no-untyped-
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def fuse(first, low, voxel, depth_scale, wanted, planes, cameras, lenses, truncation, distance, weight):  # type: ignore[no-untyped-def]
+def fuse(first, low, voxel, depth_scale, wanted, planes, cameras, lenses, truncation, distance, weight):
     """Signed distance of voxels from the surface that views see, positive before it.
 
     first       (3,) float64 the corner of the grid, in its frame; low (3,) int64 index of the first voxel

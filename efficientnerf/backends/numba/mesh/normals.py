@@ -6,7 +6,7 @@ from efficientnerf.backends.numba.runtime import PRANGE, numba
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def smooth_face_normals(normals, areas, neighbours, sharpness, out):  # type: ignore[no-untyped-def]
+def smooth_face_normals(normals, areas, neighbours, sharpness, out):
     """Of each face the mean of its own normal and those next to it, by area and exp(-difference^2 / (2 sharpness^2)).
 
     normals     (F, 3) float64 unit

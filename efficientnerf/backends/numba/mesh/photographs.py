@@ -8,7 +8,7 @@ WEIGHT = 65535.0  # of a photograph that shows a texel best
 
 
 @numba.njit(cache=True, error_model="numpy")
-def mark_edges(near, jump, begin, end, out):  # type: ignore[no-untyped-def]
+def mark_edges(near, jump, begin, end, out):
     """Sets `out` (H, W) to zero at jumps in depth between pixels of the rows `begin` to `end`, and between these and the row after them.
 
     near    (H, W) float32 inverse depth of the mesh, zero where it is not
@@ -35,7 +35,7 @@ def mark_edges(near, jump, begin, end, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def sweep_down(begin, end, out):  # type: ignore[no-untyped-def]
+def sweep_down(begin, end, out):
     """Half of a chamfer distance with steps of 1 and 1.4, from the zeros of `out` (H, W) float32: the rows `begin` to `end`, after all before them."""
     width = out.shape[1]
     for row in range(begin, end):
@@ -53,7 +53,7 @@ def sweep_down(begin, end, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def sweep_up(begin, end, out):  # type: ignore[no-untyped-def]
+def sweep_up(begin, end, out):
     """The other half: the rows `begin` to `end`, after all behind them, from the last one on."""
     height, width = out.shape
     for row in range(end - 1, begin - 1, -1):
@@ -71,7 +71,7 @@ def sweep_up(begin, end, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _jumps(left, here, other, right, jump):  # type: ignore[no-untyped-def]
+def _jumps(left, here, other, right, jump):
     """Whether the surface breaks between two pixels: on a plane inverse depths change evenly along a row."""
     if (here > 0.0) != (other > 0.0):
         return True
@@ -81,7 +81,7 @@ def _jumps(left, here, other, right, jump):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _catmull_rom(t):  # type: ignore[no-untyped-def]
+def _catmull_rom(t):
     """Weights of four pixels in a row for a place between the middle two, `t` float32 from the second on: linear interpolation would blur."""
     half, one = np.float32(0.5), np.float32(1.0)
     squared, cubed = t * t, t * t * t
@@ -91,7 +91,7 @@ def _catmull_rom(t):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def observe(  # type: ignore[no-untyped-def]
+def observe(
     begin_face, end_face, texel_begin, share, faces, pixels, depth, facing, near, clear, photo, gain, reach, slack, beside, density, sharpness, seen, weights,
 ):  # fmt: skip
     """Lets texels of faces `begin_face` to `end_face` see a photograph; of what a texel has seen the K best graded are kept.
@@ -169,7 +169,7 @@ def observe(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def blend(begin, end, seen, weights, scale, prior, vote, trust, out, known):  # type: ignore[no-untyped-def]
+def blend(begin, end, seen, weights, scale, prior, vote, trust, out, known):
     """One colour for each of the texels `begin` to `end` from what they have seen.
 
     seen, weights  as for `observe`

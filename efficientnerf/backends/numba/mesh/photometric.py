@@ -13,7 +13,7 @@ AREA = SIDE * SIDE
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def choose(vertices, centres, grades, apart, widest, out):  # type: ignore[no-untyped-def]
+def choose(vertices, centres, grades, apart, widest, out):
     """The photographs that a vertex is compared in: the one that shows it best, then one after the other that which shows it well from elsewhere.
 
     vertices  (V, 3) float64
@@ -52,7 +52,7 @@ def choose(vertices, centres, grades, apart, widest, out):  # type: ignore[no-un
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _patch(pixels, start, width, height, x, y, along, across, size, out, row):  # type: ignore[no-untyped-def]
+def _patch(pixels, start, width, height, x, y, along, across, size, out, row):
     """Samples of a patch with zero mean and unit length into `out`[row]; its standard deviation, negative where it leaves the photograph."""
     half = SIDE // 2
     reach_x = half * size * (abs(along[0]) + abs(across[0])) + np.float32(1.0)
@@ -83,7 +83,7 @@ def _patch(pixels, start, width, height, x, y, along, across, size, out, row):  
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def agreement(begin, end, chosen, places, size, step, pixels, starts, shapes, noise, score, texture):  # type: ignore[no-untyped-def]
+def agreement(begin, end, chosen, places, size, step, pixels, starts, shapes, noise, score, texture):
     """How well the photographs of each of the vertices `begin` to `end` agree at offsets along its normal.
 
     chosen   (V, K) int32 numbers of photographs, of `choose`

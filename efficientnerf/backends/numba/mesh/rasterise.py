@@ -8,7 +8,7 @@ CHUNK = 1024  # triangles that a thread takes at a time
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _pixels_between(low, high, size):  # type: ignore[no-untyped-def]
+def _pixels_between(low, high, size):
     """First and last + 1 of the pixels whose centres lie between two coordinates, in an image; coordinates may be far outside of it."""
     first = np.int64(max(0.0, np.ceil(min(low, np.float64(size)) - 0.5)))
     last = np.int64(max(-1.0, np.floor(min(high, np.float64(size)) - 0.5)))
@@ -16,7 +16,7 @@ def _pixels_between(low, high, size):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _triangle(x, y, inverse, number, top, bottom, width, near, shown):  # type: ignore[no-untyped-def]
+def _triangle(x, y, inverse, number, top, bottom, width, near, shown):
     """Lays a triangle over the rows `top` <= row < `bottom` of an image: pixels x, y (3,), inverse depth (3,) of its corners."""
     area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
     if not abs(area) > 0.0:
@@ -38,7 +38,7 @@ def _triangle(x, y, inverse, number, top, bottom, width, near, shown):  # type: 
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def row_spans(pixels, depth, faces, begin, end, height, width, rows):  # type: ignore[no-untyped-def]
+def row_spans(pixels, depth, faces, begin, end, height, width, rows):
     """First and last + 1 of the rows of an image in which triangles `begin` to `end` may hold a pixel's centre, to `rows` (F, 2) int32; both zero for those
     that cannot, most of those smaller than a pixel. The other arguments are those of `rasterise`."""
     for chunk in numba.prange((end - begin + CHUNK - 1) // CHUNK):
@@ -55,7 +55,7 @@ def row_spans(pixels, depth, faces, begin, end, height, width, rows):  # type: i
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def rasterise(pixels, depth, faces, rows, begin, end, bands, near, shown):  # type: ignore[no-untyped-def]
+def rasterise(pixels, depth, faces, rows, begin, end, bands, near, shown):
     """Lays triangles `begin` to `end` over an image; of those that a pixel's centre meets the nearest stays, of equally near ones the first.
 
     pixels  (V, 2) float64 of the vertices; nan: not in view

@@ -6,7 +6,7 @@ from efficientnerf.backends.numba.runtime import PRANGE, numba
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _weights(pixels, depth, corners, u, v, weight):  # type: ignore[no-untyped-def]
+def _weights(pixels, depth, corners, u, v, weight):
     """Weights (3,) of a triangle's corners at the pixel place u, v, with perspective; returns twice its area in pixels."""
     a, b, c = corners[0], corners[1], corners[2]
     area = (pixels[b, 0] - pixels[a, 0]) * (pixels[c, 1] - pixels[a, 1]) - (pixels[c, 0] - pixels[a, 0]) * (pixels[b, 1] - pixels[a, 1])
@@ -20,7 +20,7 @@ def _weights(pixels, depth, corners, u, v, weight):  # type: ignore[no-untyped-d
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _texel(texels, first, width, height, u, v, out):  # type: ignore[no-untyped-def]
+def _texel(texels, first, width, height, u, v, out):
     """Adds the bilinear value at u, v (v up) of a level of a texture to `out` (3,)."""
     x, y = u * width - 0.5, (1.0 - v) * height - 0.5
     x = min(x, width - 1.0) if x > 0.0 else 0.0  # also where it is no number
@@ -35,7 +35,7 @@ def _texel(texels, first, width, height, u, v, out):  # type: ignore[no-untyped-
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _add_texture(place, area, weight, texels, levels, out):  # type: ignore[no-untyped-def]
+def _add_texture(place, area, weight, texels, levels, out):
     """Adds the texture's colour at a sample to `out` (3,): `place` (3, 2) of its face's corners, `area` of the face twice, in pixels."""
     spread = (place[1, 0] - place[0, 0]) * (place[2, 1] - place[0, 1]) - (place[2, 0] - place[0, 0]) * (place[1, 1] - place[0, 1])
     ratio = abs(spread) * levels[0, 1] * levels[0, 2] / area  # texels to a sample
@@ -49,7 +49,7 @@ def _add_texture(place, area, weight, texels, levels, out):  # type: ignore[no-u
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def shade(pixels, depth, faces, coordinates, texels, levels, colours, shown, begin, end, colour):  # type: ignore[no-untyped-def]
+def shade(pixels, depth, faces, coordinates, texels, levels, colours, shown, begin, end, colour):
     """Rows `begin` to `end` of the image of a mesh: sums over the samples of each pixel, as many as are covered.
 
     pixels, depth  of the vertices, in samples, as `rasterise` takes them

@@ -20,7 +20,7 @@ _NONE, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.flo
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _gather_sums(group, first, sums, total):  # type: ignore[no-untyped-def]
+def _gather_sums(group, first, sums, total):
     """Sums of the pairs of a group, `total` (SUMS, 16) by kinds; returns bits of the Gaussians that have any, as float32 0 or 1 in row SUMS."""
     some = False
     for lane in range(LANES):
@@ -37,7 +37,7 @@ def _gather_sums(group, first, sums, total):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _geometry_gradients(p, at, lens, total, out):  # type: ignore[no-untyped-def]
+def _geometry_gradients(p, at, lens, total, out):
     """Gradients by mean, logarithms of scales, quaternion and logit into rows MEAN to OPACITY of `out`; returns the longest standard deviation."""
     _x, _y, _depth, _seen, wx, wy, nx, ny, s, turned = image16(p, at, lens)
     ax, ay, _covariance, (a, b, c) = conic16(nx, ny, s)
@@ -74,7 +74,7 @@ def _geometry_gradients(p, at, lens, total, out):  # type: ignore[no-untyped-def
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _colour_gradients(p, at, lens, degree, total, basis, out):  # type: ignore[no-untyped-def]
+def _colour_gradients(p, at, lens, degree, total, basis, out):
     """Gradients by the harmonics into rows from HARMONICS on."""
     basis16(p, at, lens, degree, basis)
     red, green, blue = colour16(p, at, degree, basis)
@@ -88,7 +88,7 @@ def _colour_gradients(p, at, lens, degree, total, basis, out):  # type: ignore[n
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _step_part(p, at, m, to, part, begin, end, rate, ahead, correction, moves, h, gradient):  # type: ignore[no-untyped-def]
+def _step_part(p, at, m, to, part, begin, end, rate, ahead, correction, moves, h, gradient):
     """Adam on rows `begin` to `end` of a group whose lanes `moves` are to move."""
     square = broadcast(_NONE, LANES)
     for row in range(begin, end):
@@ -108,7 +108,7 @@ def _step_part(p, at, m, to, part, begin, end, rate, ahead, correction, moves, h
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _step_group(p, at, m, to, lens, degree, h, drawn, total, basis, gradient, correct):  # type: ignore[no-untyped-def]
+def _step_group(p, at, m, to, lens, degree, h, drawn, total, basis, gradient, correct):
     """A step of a group with such sums of its pairs."""
     moves = load(total, 16 * SUMS, LANES) > _HALF
     visits = load(m, to, LANES)
@@ -137,7 +137,7 @@ def _step_group(p, at, m, to, lens, degree, h, drawn, total, basis, gradient, co
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def step(values, moments, lens, degree, first, sums, h, errors):  # type: ignore[no-untyped-def]
+def step(values, moments, lens, degree, first, sums, h, errors):
     """A step of all Gaussians that have pairs, in place.
 
     values   (G, rows, 16) float32, see `projection`

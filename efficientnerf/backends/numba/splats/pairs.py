@@ -32,13 +32,13 @@ class Pairs(NamedTuple):
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _range(centre, reach, side, end):  # type: ignore[no-untyped-def]
+def _range(centre, reach, side, end):
     """First cell of `side` pixels that centre - reach to centre + reach meets, and the one after the last."""
     return max(0, int((centre - reach) / side)), min(end, int((centre + reach) / side) + 1)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _tiles_of(record, columns, rows):  # type: ignore[no-untyped-def]
+def _tiles_of(record, columns, rows):
     """Tiles that a Gaussian may touch: the first column, the one after the last, and rows as well; none of one that is not in the image."""
     if not record[WIDTH] > 0:
         return 0, 0, 0, 0
@@ -47,7 +47,7 @@ def _tiles_of(record, columns, rows):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _count(records, columns, rows, length, counts, first):  # type: ignore[no-untyped-def]
+def _count(records, columns, rows, length, counts, first):
     """Pairs of each part of the Gaussians and tile in `counts` (PARTS, T), and of each Gaussian in `first` from 1 on."""
     for part in numba.prange(PARTS):
         for n in range(part * length, min(len(records), (part + 1) * length)):
@@ -59,7 +59,7 @@ def _count(records, columns, rows, length, counts, first):  # type: ignore[no-un
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _sum_up(counts, begin, first):  # type: ignore[no-untyped-def]
+def _sum_up(counts, begin, first):
     """Counts become the first pair of each part in each tile, those of a tile in the order of the parts."""
     total = 0
     for tile in range(counts.shape[1]):
@@ -74,7 +74,7 @@ def _sum_up(counts, begin, first):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _ellipse(record):  # type: ignore[no-untyped-def]
+def _ellipse(record):
     """What `_across` needs of a Gaussian, float64: its place, 1 / a and b of its conic, determinant, squared reach times a, and how far down its
     rightmost point is."""
     a, b, c = float(record[CONIC_A]), float(record[CONIC_B]), float(record[CONIC_C])
@@ -85,7 +85,7 @@ def _ellipse(record):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _across(ellipse, row, begin, end):  # type: ignore[no-untyped-def]
+def _across(ellipse, row, begin, end):
     """Of the blocks `begin` to `end` of a row of blocks, the first with the centre of a pixel in the ellipse, and the one after the last."""
     x, y, per_a, b, determinant, square, down = ellipse
     if not determinant > 0:  # float32 holds no such ellipse
@@ -104,7 +104,7 @@ def _across(ellipse, row, begin, end):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _masks(record, tiles, columns, rows, masks):  # type: ignore[no-untyped-def]
+def _masks(record, tiles, columns, rows, masks):
     """Blocks of the tiles of a Gaussian, row by row."""
     left, right, tile_row, _bottom = tiles
     begin, end = _range(record[X], record[WIDTH], np.float32(BLOCK), 4 * columns)
@@ -121,7 +121,7 @@ def _masks(record, tiles, columns, rows, masks):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _fill(records, columns, rows, length, counts, first, masks, keys, gaussian):  # type: ignore[no-untyped-def]
+def _fill(records, columns, rows, length, counts, first, masks, keys, gaussian):
     """Masks (P,) by slot; and of the pairs of each tile, by number, `keys`, their depth's bits above their slot, and their Gaussians (P,)."""
     bits = records.view(np.uint32)
     for part in numba.prange(PARTS):
@@ -138,7 +138,7 @@ def _fill(records, columns, rows, length, counts, first, masks, keys, gaussian):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _sort(keys, other, gaussian, other_gaussian, counts):  # type: ignore[no-untyped-def]
+def _sort(keys, other, gaussian, other_gaussian, counts):
     """Radix sort by the upper half of the keys, which keeps the order of equals; returns whether the result is in the other arrays."""
     swapped = False
     for digit in range(32, 64, DIGIT):
@@ -159,7 +159,7 @@ def _sort(keys, other, gaussian, other_gaussian, counts):  # type: ignore[no-unt
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _by_depth(begin, masks, keys, gaussian, other, other_gaussian, mask, slot):  # type: ignore[no-untyped-def]
+def _by_depth(begin, masks, keys, gaussian, other, other_gaussian, mask, slot):
     """The pairs of each tile by depth, nearest first; of `keys` and `gaussian` as `_fill` leaves them. The arrays `other` are scratch."""
     tiles = len(begin) - 1
     for task in numba.prange((tiles + TILES_A_TASK - 1) // TILES_A_TASK):
@@ -175,7 +175,7 @@ def _by_depth(begin, masks, keys, gaussian, other, other_gaussian, mask, slot): 
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _pairs(records, columns, rows):  # type: ignore[no-untyped-def]
+def _pairs(records, columns, rows):
     length, tiles = (len(records) + PARTS - 1) // PARTS, columns * rows
     counts, begin, first = np.zeros((PARTS, tiles), np.int64), np.empty(tiles + 1, np.int64), np.zeros(len(records) + 1, np.int64)
     _count(records, columns, rows, length, counts, first)

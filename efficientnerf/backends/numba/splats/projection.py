@@ -43,7 +43,7 @@ _NONE, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.flo
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _plane(x, y, z, lens):  # type: ignore[no-untyped-def]
+def _plane(x, y, z, lens):
     """Points of the camera on the undistorted plane (u, v), whether each can be seen there, and the derivative of (u, v), kept within the limits: three numbers
     each."""
     if lens.fisheye:
@@ -65,7 +65,7 @@ def _plane(x, y, z, lens):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _distorted(u, v, lens):  # type: ignore[no-untyped-def]
+def _distorted(u, v, lens):
     """Points of the undistorted plane, distorted, and the derivative: x_u, x_v, y_u, y_v."""
     n = lens.numbers
     s = u * u + v * v
@@ -85,7 +85,7 @@ def _distorted(u, v, lens):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def rotation16(p, at):  # type: ignore[no-untyped-def]
+def rotation16(p, at):
     """The unit quaternion of a group and its length, and the matrix by rows."""
     at += 16 * ROTATION
     w, x, y, z = load(p, at, LANES), load(p, at + 16, LANES), load(p, at + 32, LANES), load(p, at + 48, LANES)
@@ -100,7 +100,7 @@ def rotation16(p, at):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def image16(p, at, lens):  # type: ignore[no-untyped-def]
+def image16(p, at, lens):
     """A group in the image: (x, y) pixels, depth, whether it can be seen; the derivative of (x, y) by the point of the world (2, 3); that times the rotation
     (2, 3); the standard deviations; and the rotation."""
     t, n = lens.turn, lens.numbers
@@ -129,7 +129,7 @@ def image16(p, at, lens):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def conic16(nx, ny, scales):  # type: ignore[no-untyped-def]
+def conic16(nx, ny, scales):
     """The covariance in the image (xx, xy, yy) with LOW_PASS, and its inverse."""
     ax, ay = (nx[0] * scales[0], nx[1] * scales[1], nx[2] * scales[2]), (ny[0] * scales[0], ny[1] * scales[1], ny[2] * scales[2])
     xx, yy = ax[0] * ax[0] + ax[1] * ax[1] + ax[2] * ax[2] + LOW_PASS, ay[0] * ay[0] + ay[1] * ay[1] + ay[2] * ay[2] + LOW_PASS
@@ -141,7 +141,7 @@ def conic16(nx, ny, scales):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def basis16(p, at, lens, degree, out):  # type: ignore[no-untyped-def]
+def basis16(p, at, lens, degree, out):
     """Harmonics of the view directions of a group, `out` (K, 16)."""
     x, y, z = load(p, at, LANES) - lens.centre[0], load(p, at + 16, LANES) - lens.centre[1], load(p, at + 32, LANES) - lens.centre[2]
     length = sqrt(maximum(x * x + y * y + z * z, np.float32(1e-30)))
@@ -149,7 +149,7 @@ def basis16(p, at, lens, degree, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def colour16(p, at, degree, basis):  # type: ignore[no-untyped-def]
+def colour16(p, at, degree, basis):
     """1/2 + the sum of the harmonics of a group, three channels; not clipped."""
     red, green, blue = broadcast(_HALF, LANES), broadcast(_HALF, LANES), broadcast(_HALF, LANES)
     for k in range((degree + 1) * (degree + 1)):
@@ -159,7 +159,7 @@ def colour16(p, at, degree, basis):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _project_group(p, at, lens, degree, basis, row, out, first):  # type: ignore[no-untyped-def]
+def _project_group(p, at, lens, degree, basis, row, out, first):
     """Records of a group into out[first : first + 16]; WIDTH is 0 for what is not in the image."""
     x, y, depth, seen, _wx, _wy, nx, ny, scales, _turned = image16(p, at, lens)
     _ax, _ay, covariance, conic = conic16(nx, ny, scales)
@@ -190,7 +190,7 @@ def _project_group(p, at, lens, degree, basis, row, out, first):  # type: ignore
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def project(values, lens, degree, out):  # type: ignore[no-untyped-def]
+def project(values, lens, degree, out):
     """Records (16 G, RECORD) float32 of Gaussians (G, rows, 16), in the image of a lens."""
     groups, rows = values.shape[0], values.shape[1]
     for task in numba.prange((groups + GROUPS_A_TASK - 1) // GROUPS_A_TASK):

@@ -40,7 +40,7 @@ _C1, _C2 = np.float32(layout.SSIM_C1), np.float32(layout.SSIM_C2)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _exponent(p, at, x, y):  # type: ignore[no-untyped-def]
+def _exponent(p, at, x, y):
     """A Gaussian's distances from pixels, and what it hides before it is capped."""
     dx, dy = x - p[at + X], y - p[at + Y]
     q = dx * (dx * p[at + CONIC_A] + dy * (_TWO * p[at + CONIC_B])) + dy * dy * p[at + CONIC_C]
@@ -48,7 +48,7 @@ def _exponent(p, at, x, y):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _blend(p, bit, first, end, gaussian, mask, x, y, open_, met, place):  # type: ignore[no-untyped-def]
+def _blend(p, bit, first, end, gaussian, mask, x, y, open_, met, place):
     """A block front to back: colour, transmittance and how many pairs were met, whose numbers go to `met`."""
     red, green, blue, light = broadcast(_NONE, LANES), broadcast(_NONE, LANES), broadcast(_NONE, LANES), broadcast(_ONE, LANES)
     count = 0
@@ -78,7 +78,7 @@ def _blend(p, bit, first, end, gaussian, mask, x, y, open_, met, place):  # type
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _pixels(left, top, width, height, xs, ys):  # type: ignore[no-untyped-def]
+def _pixels(left, top, width, height, xs, ys):
     """Centres of the pixels of a block into `xs` and `ys`, and bits of those in the image."""
     inside = 0
     for lane in range(16):
@@ -90,7 +90,7 @@ def _pixels(left, top, width, height, xs, ys):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _render_tile(tile, p, pairs, width, height, met, place, xs, ys, colour, transmittance):  # type: ignore[no-untyped-def]
+def _render_tile(tile, p, pairs, width, height, met, place, xs, ys, colour, transmittance):
     row, column = tile // pairs.columns, tile % pairs.columns
     for block in range(16):
         left, top = column * TILE + block % 4 * BLOCK, row * TILE + block // 4 * BLOCK
@@ -107,7 +107,7 @@ def _render_tile(tile, p, pairs, width, height, met, place, xs, ys, colour, tran
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _render(begin, end, workers, task, records, pairs, longest, colour, transmittance):  # type: ignore[no-untyped-def]
+def _render(begin, end, workers, task, records, pairs, longest, colour, transmittance):
     for _ in numba.prange(workers):
         met, place = np.empty(longest, np.int64), np.empty(64, np.float32)
         xs, ys = np.empty(16, np.float32), np.empty(16, np.float32)
@@ -118,7 +118,7 @@ def _render(begin, end, workers, task, records, pairs, longest, colour, transmit
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _add_structure(p, picture):  # type: ignore[no-untyped-def]
+def _add_structure(p, picture):
     """Half of the derivatives of 1 - SSIM of a block, which is a window of it, added to those of its squared error; p: pointer to `slopes`."""
     share, by_light = _ONE / np.float32(LANES), load(p, 48, LANES)
     for channel in range(3):
@@ -135,7 +135,7 @@ def _add_structure(p, picture):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _residual(left, top, place, picture, slopes):  # type: ignore[no-untyped-def]
+def _residual(left, top, place, picture, slopes):
     """The squared error of a block, whose colours and transmittances are in `place`. Half of the derivatives of the error, structure included, go into the
     first 64 of `slopes`, each pixel's squared error into the next 16, and the colours wanted, over grey or the background, into the last 48.
 
@@ -173,7 +173,7 @@ def _residual(left, top, place, picture, slopes):  # type: ignore[no-untyped-def
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _pull(p, met, count, gaussian, slot, x, y, inside, place, slopes, sums):  # type: ignore[no-untyped-def]
+def _pull(p, met, count, gaussian, slot, x, y, inside, place, slopes, sums):
     """Sums of the pairs that a block met, added to theirs: what the error changes by, with -q / 2 (v), with that times distances (v dx, v dy, v dx dx, v dx dy,
     v dy dy) and with the colour; and the error where it shows."""
     by_red, by_green, by_blue, error = load(slopes, 0, LANES), load(slopes, 16, LANES), load(slopes, 32, LANES), load(slopes, 64, LANES)
@@ -205,7 +205,7 @@ def _pull(p, met, count, gaussian, slot, x, y, inside, place, slopes, sums):  # 
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _fit_tile(tile, p, pairs, picture, met, place, slopes, xs, ys, sums):  # type: ignore[no-untyped-def]
+def _fit_tile(tile, p, pairs, picture, met, place, slopes, xs, ys, sums):
     row, column, (height, width), total = tile // pairs.columns, tile % pairs.columns, picture.mask.shape, 0.0
     for pair in range(pairs.begin[tile], pairs.begin[tile + 1]):
         for n in range(SUMS):
@@ -222,7 +222,7 @@ def _fit_tile(tile, p, pairs, picture, met, place, slopes, xs, ys, sums):  # typ
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _fit(begin, end, workers, task, records, pairs, longest, picture, sums, errors):  # type: ignore[no-untyped-def]
+def _fit(begin, end, workers, task, records, pairs, longest, picture, sums, errors):
     for _ in numba.prange(workers):
         met, place, slopes = np.empty(longest, np.int64), np.empty(64, np.float32), np.empty(128, np.float32)
         xs, ys = np.empty(16, np.float32), np.empty(16, np.float32)

@@ -88,7 +88,7 @@ def dense_densities(cells: Cells, places: np.ndarray, density: np.ndarray) -> np
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def tree_pointers(cells, density):  # type: ignore[no-untyped-def]
+def tree_pointers(cells, density):
     """See `TreePointers`."""
     return TreePointers(
         cells.brick, cells.brick * cells.brick * cells.brick, cells.voxel_index.size, 1.0 / cells.brick, cells.nearest, cells.step, cells.step_length,
@@ -98,7 +98,7 @@ def tree_pointers(cells, density):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def stored_voxel(i, j, k, cascade, tree):  # type: ignore[no-untyped-def]
+def stored_voxel(i, j, k, cascade, tree):
     """Index of the stored voxel (i, j, k) of a cascade, or -1."""
     if i < 0 or j < 0 or k < 0:
         return np.int32(-1)
@@ -114,7 +114,7 @@ def stored_voxel(i, j, k, cascade, tree):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def corner_voxels(i, j, k, cascade, tree, index):  # type: ignore[no-untyped-def]
+def corner_voxels(i, j, k, cascade, tree, index):
     """The stored voxels (i or i + 1, j or j + 1, k or k + 1), z fastest, into `index` (8,); -1 where there is none."""
     brick = tree.brick
     li, lj, lk = i % brick, j % brick, k % brick
@@ -134,6 +134,6 @@ def corner_voxels(i, j, k, cascade, tree, index):  # type: ignore[no-untyped-def
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def corner_weight(n, fx, fy, fz):  # type: ignore[no-untyped-def]
+def corner_weight(n, fx, fy, fz):
     """Trilinear weight of corner n."""
     return (fx if n & 4 else 1 - fx) * (fy if n & 2 else 1 - fy) * (fz if n & 1 else 1 - fz)

@@ -11,7 +11,7 @@ from efficientnerf.backends.numba.vector.memory import pointer
 
 
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
-def _raise(point, cell, t, cascade, tree, scene, state):  # type: ignore[no-untyped-def]
+def _raise(point, cell, t, cascade, tree, scene, state):
     """Raises the voxels around a sample to its weight.
 
     scene  pointers to what is raised (N,), of its type `zero`, and to scratch (8,); transmittance at which the ray arrives
@@ -46,7 +46,7 @@ _march = march_with(_raise)
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _max_contributions(cells, origins, directions, density, stop, transmittance, visibility):  # type: ignore[no-untyped-def]
+def _max_contributions(cells, origins, directions, density, stop, transmittance, visibility):
     """Share p of the rays raises visibility[p]: no races, and a maximum does not depend on the order."""
     shares, rays = len(visibility), len(origins)
     for share in numba.prange(shares):

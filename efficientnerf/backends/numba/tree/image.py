@@ -17,7 +17,7 @@ WORK = 2**25  # of a thread in one call, about 0.2 s: samples tested, and what i
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _place(block, down, across):  # type: ignore[no-untyped-def]
+def _place(block, down, across):
     """Row and column of a block: they are taken column by column of bands of BAND rows, so that those taken one after the other share bricks."""
     upper = block // (BAND * across) * BAND
     tall, n = min(BAND, down - upper), block - upper * across
@@ -25,7 +25,7 @@ def _place(block, down, across):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _render_blocks(worker, threads, budget, progress, height, tile, rays, background, scene, colours, voxel, scratch, outputs):  # type: ignore[no-untyped-def]
+def _render_blocks(worker, threads, budget, progress, height, tile, rays, background, scene, colours, voxel, scratch, outputs):
     """Renders blocks of an image, which threads take one after the other, from where `progress` says, see `render_batch`, until none is left or the budget is
     spent. Some blocks are of background and cost little.
     """
@@ -61,7 +61,7 @@ def beginning(threads: int) -> np.ndarray:
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def render_batch(  # type: ignore[no-untyped-def]
+def render_batch(
     batch, background, packed, brick, view_colours, views, voxel, tile, threads, budget, progress,
     colour, opacity, depth, normal,
 ):  # fmt: skip
@@ -107,7 +107,7 @@ def render_batch(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def downsample(supersample, fine_colour, fine_opacity, fine_depth, fine_normal, colour, opacity, depth, normal):  # type: ignore[no-untyped-def]
+def downsample(supersample, fine_colour, fine_opacity, fine_depth, fine_normal, colour, opacity, depth, normal):
     """Pixels from their supersample^2 rays: mean colour and opacity, median depth, mean normal.
 
     The median is over all rays, those without a hit last; a mean of the depths of two surfaces would lie on neither.

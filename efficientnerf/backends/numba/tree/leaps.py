@@ -8,7 +8,7 @@ CELLS_PER_CALL = 2**25
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _nearer(out, x, y, z, found):  # type: ignore[no-untyped-def]
+def _nearer(out, x, y, z, found):
     """The least of `found` and the values of three cells along z around (x, y, z)."""
     found = min(found, out[x, y, z])
     if z > 0:
@@ -19,7 +19,7 @@ def _nearer(out, x, y, z, found):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _sweep(out, begin, end, step):  # type: ignore[no-untyped-def]
+def _sweep(out, begin, end, step):
     """Lower the cells of layers begin, begin + step, ... to one more than the least of their neighbours that come before them in this direction."""
     nx, ny, nz = out.shape
     most = np.uint8(255)
@@ -61,7 +61,7 @@ def leaps(occupied: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _sweep_octants(occupied, out):  # type: ignore[no-untyped-def]
+def _sweep_octants(occupied, out):
     nx, ny, nz = occupied.shape
     for octant in numba.prange(8):
         sx, sy, sz = 1 if octant & 1 else -1, 1 if octant & 2 else -1, 1 if octant & 4 else -1

@@ -26,13 +26,13 @@ PARALLEL = np.float32(1e-30)  # component of a unit direction below which a ray 
 
 
 @numba.njit(cache=True, error_model="numpy")
-def most_samples(nx, ny, nz, step):  # type: ignore[no-untyped-def]
+def most_samples(nx, ny, nz, step):
     """Samples on a ray through a grid of so many voxels, `step` apart, at most. Distances far beyond the grid are rounded to more than that."""
     return int(np.ceil(np.sqrt(nx * nx + ny * ny + nz * nz) / step)) + 2
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def box_distances(ox, oy, oz, dx, dy, dz, nx, ny, nz):  # type: ignore[no-untyped-def]
+def box_distances(ox, oy, oz, dx, dy, dz, nx, ny, nz):
     """Distances at which a ray enters, 0 at least, and leaves the box of a grid of so many voxels; the second is not greater where it misses it."""
     ix = 1 / dx if dx != 0 else 1e30
     iy = 1 / dy if dy != 0 else 1e30
@@ -45,7 +45,7 @@ def box_distances(ox, oy, oz, dx, dy, dz, nx, ny, nz):  # type: ignore[no-untype
 
 
 @numba.njit(cache=True, error_model="numpy")
-def cascade_distances(origin, direction, tree, n):  # type: ignore[no-untyped-def]
+def cascade_distances(origin, direction, tree, n):
     """Distances at which a ray enters and leaves the box of cascade n, voxels of cascade 0; see `box_distances`."""
     x, y, z = origin[0] - tree.corner[3 * n], origin[1] - tree.corner[3 * n + 1], origin[2] - tree.corner[3 * n + 2]
     side = tree.scale[n] * tree.brick
@@ -55,17 +55,17 @@ def cascade_distances(origin, direction, tree, n):  # type: ignore[no-untyped-de
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _cube_exit(o, d, inverse, cell, leap, brick):  # type: ignore[no-untyped-def]
+def _cube_exit(o, d, inverse, cell, leap, brick):
     """Distance at which a ray leaves the empty cube of cells around its own, along one axis."""
     exit_ = ((cell + leap) * brick - o) * inverse if d > 0 else ((cell - leap + 1) * brick - o) * inverse
     return exit_ if d != 0 else 1e30
 
 
-def _visit(point, cell, t, cascade, tree, scene, state):  # type: ignore[no-untyped-def]
+def _visit(point, cell, t, cascade, tree, scene, state):
     raise NotImplementedError("`march_with` puts a visitor here")
 
 
-def _through_cascade(origin, direction, t0, t1, clear, cascade, tree, stop, scene, state):  # type: ignore[no-untyped-def]
+def _through_cascade(origin, direction, t0, t1, clear, cascade, tree, stop, scene, state):
     """Visits the samples of a ray between two distances in one cascade, all in its voxels; returns the state behind them."""
     (ox, oy, oz), (dx, dy, dz), brick, first = origin, direction, tree.brick, tree.first[cascade]
     ny, nz = tree.shape[3 * cascade + 1], tree.shape[3 * cascade + 2]
@@ -97,7 +97,7 @@ def _through_cascade(origin, direction, t0, t1, clear, cascade, tree, stop, scen
     return state
 
 
-def _march(origin, direction, clear, tree, stop, scene, state):  # type: ignore[no-untyped-def]
+def _march(origin, direction, clear, tree, stop, scene, state):
     """Part p of a ray lies in cascade |L - 1 - p|, before or behind the box that is cut out of that."""
     outermost = tree.cascades - 1
     for part in range(2 * outermost + 1):

@@ -19,7 +19,7 @@ BLOCK = 64  # rays per task
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _shade(sh, basis, terms, rgb):  # type: ignore[no-untyped-def]
+def _shade(sh, basis, terms, rgb):
     """Sigmoid of the sum of one voxel's harmonics (K, 3) into `rgb`; all are pointers."""
     for c in range(3):
         logit = 0.0
@@ -29,7 +29,7 @@ def _shade(sh, basis, terms, rgb):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
-def _composite(point, cell, t, cascade, tree, scene, state):  # type: ignore[no-untyped-def]
+def _composite(point, cell, t, cascade, tree, scene, state):
     """Adds a sample to the colour of a ray.
 
     scene  pointers to harmonics (N, 3 K), those of the direction (K,), the colour of the voxel that was shaded last, and that of the ray; and K
@@ -59,7 +59,7 @@ _march = march_with(_composite)
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _render(cells, density, sh, origins, directions, bases, colour, opacity, half_distance):  # type: ignore[no-untyped-def]
+def _render(cells, density, sh, origins, directions, bases, colour, opacity, half_distance):
     rays, terms = len(origins), bases.shape[1]
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):
         rgb, tree = np.empty(3), tree_pointers(cells, density)

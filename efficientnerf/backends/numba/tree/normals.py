@@ -11,7 +11,7 @@ _HALF, _ONE, _NONE = np.float32(0.5), np.float32(1), np.float32(0)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _row_density(row, k, fz, gz, grid):  # type: ignore[no-untyped-def]
+def _row_density(row, k, fz, gz, grid):
     """Density between voxels k and k + 1 of rows, numbered over all bricks."""
     if grid.narrow:
         mask = gather(grid.rows, row)
@@ -25,7 +25,7 @@ def _row_density(row, k, fz, gz, grid):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _densities(u, v, w, lanes, grid):  # type: ignore[no-untyped-def]
+def _densities(u, v, w, lanes, grid):
     """Densities at points, voxel coordinates; 0 outside of the grid and in empty cells, and where `lanes` are not set."""
     brick, width, per_brick = grid.brick, np.float32(grid.brick), np.float32(1 / grid.brick)
     nx, ny, nz = np.float32(grid.nx), np.float32(grid.ny), np.float32(grid.nz)
@@ -47,7 +47,7 @@ def _densities(u, v, w, lanes, grid):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def add_normals(lanes, x, y, z, grid, floats):  # type: ignore[no-untyped-def]
+def add_normals(lanes, x, y, z, grid, floats):
     """Unit normals at points whose coordinates, voxels, are in `floats` at x, y and z, of the rays whose bits are set: down the density's gradient by central
     differences of one voxel; zero where the density is flat."""
     u, v, w = load(floats, x, LANES), load(floats, y, LANES), load(floats, z, LANES)

@@ -84,7 +84,7 @@ class Packed(NamedTuple):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _block_has_density(owner, cells, brick, brick_index, voxel_index, values, dense):  # type: ignore[no-untyped-def]
+def _block_has_density(owner, cells, brick, brick_index, voxel_index, values, dense):
     """Whether a brick's voxels, and those in the layer around them, have density, into (b + 2, b + 2, b + 2) uint8."""
     dense[:] = 0
     for n in range(27):
@@ -105,7 +105,7 @@ def _block_has_density(owner, cells, brick, brick_index, voxel_index, values, de
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _has_density(first, end, cells, brick, brick_index, voxel_index, values, out):  # type: ignore[no-untyped-def]
+def _has_density(first, end, cells, brick, brick_index, voxel_index, values, out):
     """`Packed.has_density` of bricks first <= B < end into `out`, which is zero."""
     side = brick + 2
     for task in numba.prange((end - first + 255) // 256):

@@ -16,7 +16,7 @@ STEP_BACK = 0.5  # voxels
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _corners(u, v, w, tree, index, weight):  # type: ignore[no-untyped-def]
+def _corners(u, v, w, tree, index, weight):
     """The eight stored voxels around a point, voxel coordinates, and their trilinear weights."""
     x, y, z = u - np.float32(0.5), v - np.float32(0.5), w - np.float32(0.5)
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
@@ -28,7 +28,7 @@ def _corners(u, v, w, tree, index, weight):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _density(u, v, w, tree, index, weight):  # type: ignore[no-untyped-def]
+def _density(u, v, w, tree, index, weight):
     """Density at a point, voxel coordinates; zero in an empty coarse cell. Leaves the corners in `index` and `weight`."""
     # Compared before conversion to integers: NaN and what is too large must not become an index.
     brick = tree.brick
@@ -46,7 +46,7 @@ def _density(u, v, w, tree, index, weight):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _normal(u, v, w, tree, index, weight, out):  # type: ignore[no-untyped-def]
+def _normal(u, v, w, tree, index, weight, out):
     """Unit normal, down the density's gradient by central differences of one voxel, into `out`; zero where the density is flat."""
     h = np.float32(1)
     gx = _density(u + h, v, w, tree, index, weight)
@@ -63,7 +63,7 @@ def _normal(u, v, w, tree, index, weight, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _colour(index, weight, sh, basis, out):  # type: ignore[no-untyped-def]
+def _colour(index, weight, sh, basis, out):
     """Sigmoid of the harmonics' sum, coefficients interpolated over the corners that are stored."""
     r = g = b = total = np.float32(0)
     for n in range(8):
@@ -90,7 +90,7 @@ def _colour(index, weight, sh, basis, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _densities(points, grid, density, out):  # type: ignore[no-untyped-def]
+def _densities(points, grid, density, out):
     for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
         index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
         tree = tree_pointers(grid, density)
@@ -99,7 +99,7 @@ def _densities(points, grid, density, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _distances_back(points, directions, optical, step, most, grid, density, out):  # type: ignore[no-untyped-def]
+def _distances_back(points, directions, optical, step, most, grid, density, out):
     for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
         index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
         tree = tree_pointers(grid, density)
@@ -118,7 +118,7 @@ def _distances_back(points, directions, optical, step, most, grid, density, out)
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _normals(points, grid, density, out):  # type: ignore[no-untyped-def]
+def _normals(points, grid, density, out):
     for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
         index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
         tree = tree_pointers(grid, density)
@@ -127,7 +127,7 @@ def _normals(points, grid, density, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _colours(points, bases, grid, density, sh, out):  # type: ignore[no-untyped-def]
+def _colours(points, bases, grid, density, sh, out):
     for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
         index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
         tree = tree_pointers(grid, density)

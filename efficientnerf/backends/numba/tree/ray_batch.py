@@ -68,7 +68,7 @@ class RayPointers(NamedTuple):
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def ray_pointers(batch):  # type: ignore[no-untyped-def]
+def ray_pointers(batch):
     """See `RayPointers`."""
     kind = GIVEN_RAYS if len(batch.origins) > 0 else DIRECTION_TABLE if len(batch.camera_directions) > 0 else PINHOLE
     width = batch.origins.shape[1] if kind == GIVEN_RAYS else batch.camera_directions.shape[1]
@@ -81,12 +81,12 @@ def ray_pointers(batch):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _rotate(r, x, y, z):  # type: ignore[no-untyped-def]
+def _rotate(r, x, y, z):
     return r[0] * x + r[1] * y + r[2] * z, r[3] * x + r[4] * y + r[5] * z, r[6] * x + r[7] * y + r[8] * z
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def pinhole_direction(x, y, rays):  # type: ignore[no-untyped-def]
+def pinhole_direction(x, y, rays):
     """Unit direction through (x, y), pixels, and its component along the view axis; of one ray or of those in lanes."""
     u, v = (x - rays.cx) / rays.fx, (y - rays.cy) / rays.fy
     cosine = 1.0 / sqrt(u * u + v * v + 1.0)
@@ -95,7 +95,7 @@ def pinhole_direction(x, y, rays):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def ray_at(row, column, rays):  # type: ignore[no-untyped-def]
+def ray_at(row, column, rays):
     """Origin, direction, and cosine to the view axis, by which a distance along the ray becomes a depth; 1 for given rays."""
     p = 3 * (row * rays.width + column)
     if rays.kind == GIVEN_RAYS:
@@ -109,7 +109,7 @@ def ray_at(row, column, rays):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def tile_rays(top, low, left, right, rays, warped, looking):  # type: ignore[no-untyped-def]
+def tile_rays(top, low, left, right, rays, warped, looking):
     """The rays of rows top to low and columns left to right in the frame of the tree: these, or for `warped` rays given ones, of this tile alone.
 
     warped, looking  float64 and float32 scratch for a tile, see `layout`: into it go the rays and what leads back to the world
@@ -138,14 +138,14 @@ def tile_rays(top, low, left, right, rays, warped, looking):  # type: ignore[no-
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def world_depth(n, along, warped):  # type: ignore[no-untyped-def]
+def world_depth(n, along, warped):
     """Depth along the view axis, float32, of a point `along` the n-th ray of a tile that `tile_rays` warped, units of the frame."""
     distance = world_distance(np.float64(along), warped[WARPED_BEGIN + n], warped[WARPED_SPEED + n], warped[WARPED_BEND + n])
     return np.float32(np.float64(distance) * warped[WARPED_COSINE + n])
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def normal_in_world(n, along, nx, ny, nz, ndc, warped):  # type: ignore[no-untyped-def]
+def normal_in_world(n, along, nx, ny, nz, ndc, warped):
     """The normal of the frame (nx, ny, nz) at that point as one of the world."""
     at, s = 3 * n, np.float64(along)
     x = warped[WARPED_ORIGIN + at] * ndc[18] + ndc[15] + s * warped[WARPED_DIRECTION + at]
@@ -155,13 +155,13 @@ def normal_in_world(n, along, nx, ny, nz, ndc, warped):  # type: ignore[no-untyp
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def in_cascade(x, y, z, grid):  # type: ignore[no-untyped-def]
+def in_cascade(x, y, z, grid):
     """Voxel coordinates of a point, of those in cascade 0."""
     return x / grid.ratio + grid.shift_x, y / grid.ratio + grid.shift_y, z / grid.ratio + grid.shift_z
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _empty_radius(x, y, z, grid):  # type: ignore[no-untyped-def]
+def _empty_radius(x, y, z, grid):
     """Radius of a ball around a point, voxel coordinates, that touches no occupied cell."""
     brick = grid.brick
     nx, ny, nz = grid.nx * brick, grid.ny * brick, grid.nz * brick
@@ -179,7 +179,7 @@ def _empty_radius(x, y, z, grid):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _clear_cone(origin, direction, radius, widening, t, grid):  # type: ignore[no-untyped-def]
+def _clear_cone(origin, direction, radius, widening, t, grid):
     """Distance up to which all rays of a cone are clear; infinity where they never meet an occupied cell.
 
     origin, direction  (x, y, z) of its axis, voxel coordinates of cascade 0
@@ -207,7 +207,7 @@ def _clear_cone(origin, direction, radius, widening, t, grid):  # type: ignore[n
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _clear_pinhole(top, low, left, right, since, rays, grid):  # type: ignore[no-untyped-def]
+def _clear_pinhole(top, low, left, right, since, rays, grid):
     """`clear_distance` for a pinhole camera: the corners of the tile are farthest from its middle."""
     ax, ay, az, _ = pinhole_direction((left + right) / 2 * rays.pitch, (top + low) / 2 * rays.pitch, rays)
     widening = 0.0
@@ -219,7 +219,7 @@ def _clear_pinhole(top, low, left, right, since, rays, grid):  # type: ignore[no
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _clear_directions(top, low, left, right, since, rays, grid):  # type: ignore[no-untyped-def]
+def _clear_directions(top, low, left, right, since, rays, grid):
     """The same for a table of directions."""
     d = rays.camera_directions
     m = 3 * ((top + low) // 2 * rays.width + (left + right) // 2)
@@ -233,7 +233,7 @@ def _clear_directions(top, low, left, right, since, rays, grid):  # type: ignore
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _clear_rays(top, low, left, right, since, rays, grid):  # type: ignore[no-untyped-def]
+def _clear_rays(top, low, left, right, since, rays, grid):
     """The same for given rays."""
     o, d = rays.origins, rays.directions
     m = 3 * ((top + low) // 2 * rays.width + (left + right) // 2)
@@ -247,7 +247,7 @@ def _clear_rays(top, low, left, right, since, rays, grid):  # type: ignore[no-un
 
 
 @numba.njit(cache=True, error_model="numpy")
-def clear_distance(top, low, left, right, since, rays, grid):  # type: ignore[no-untyped-def]
+def clear_distance(top, low, left, right, since, rays, grid):
     """Distance, voxels of the grid, up to which the rays of rows top to low and columns left to right are clear in it, at least `since`."""
     if rays.kind == GIVEN_RAYS:
         return _clear_rays(top, low, left, right, since, rays, grid)

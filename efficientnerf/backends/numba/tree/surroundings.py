@@ -16,7 +16,7 @@ RAYS_PER_CALL = 2**20  # so that signals are answered between calls
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _lookup(x, y, z, environment, height, width, out):  # type: ignore[no-untyped-def]
+def _lookup(x, y, z, environment, height, width, out):
     """`efficientnerf.rendering.environment.lookup` of one direction into (3,); zero where it is not finite."""
     out[0] = out[1] = out[2] = 0.0
     if not np.isfinite(x + y + z):
@@ -33,7 +33,7 @@ def _lookup(x, y, z, environment, height, width, out):  # type: ignore[no-untype
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _add(first, end, batch, environment, opacity, colour):  # type: ignore[no-untyped-def]
+def _add(first, end, batch, environment, opacity, colour):
     height, width = environment.shape[:2]
     for row in numba.prange(first, end):
         rays, texels, behind = ray_pointers(batch), pointer(environment), np.empty(3)

@@ -104,7 +104,7 @@ class PackedPointers(NamedTuple):
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def packed_pointers(packed, brick, cascade):  # type: ignore[no-untyped-def]
+def packed_pointers(packed, brick, cascade):
     """See `PackedPointers`."""
     grids, places = packed.grids, packed.places
     first = grids[cascade, 3]
@@ -121,7 +121,7 @@ def packed_pointers(packed, brick, cascade):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def sh_basis(x, y, z, degree, out):  # type: ignore[no-untyped-def]
+def sh_basis(x, y, z, degree, out):
     """`efficientnerf.rendering.harmonics.basis` of one direction into (K,), or of four, given as Float32x4, into (K, 4)."""
     two, three, four, seven = np.float32(2), np.float32(3), np.float32(4), np.float32(7)
     xx, yy, zz = x * x, y * y, z * z
@@ -157,7 +157,7 @@ def sh_basis(x, y, z, degree, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def sh_colour(n, grid, basis, lane, lanes):  # type: ignore[no-untyped-def]
+def sh_colour(n, grid, basis, lane, lanes):
     """Red, green and blue of voxel n of the packed order before the sigmoid; the harmonics of the direction are basis[lane :: lanes]."""
     y = basis[lane]
     if grid.coded:
@@ -182,7 +182,7 @@ def sh_colour(n, grid, basis, lane, lanes):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _eight_codes(count, density, scale, base, table, codes, palette, basis, out):  # type: ignore[no-untyped-def]
+def _eight_codes(count, density, scale, base, table, codes, palette, basis, out):
     """Density, red, green and blue of `count` voxels, at most sixteen, by eight codes each into 256 entries: numbers that loops are unrolled by.
 
     basis  (9, 16) float32, of the direction of each
@@ -197,7 +197,7 @@ def _eight_codes(count, density, scale, base, table, codes, palette, basis, out)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def view_direction(x, y, z, direction):  # type: ignore[no-untyped-def]
+def view_direction(x, y, z, direction):
     """Direction, of any length, along which a point (x, y, z), voxel coordinates, is seen; see `View`."""
     return (
         direction[0] * x + direction[1] * y + direction[2] * z + direction[3],
@@ -207,7 +207,7 @@ def view_direction(x, y, z, direction):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _colours(first, end, cascade, packed, direction, cone, density_scale, degree, basis, out):  # type: ignore[no-untyped-def]
+def _colours(first, end, cascade, packed, direction, cone, density_scale, degree, basis, out):
     """`compute_view_colours`, one after the other; directions and harmonics are those of sixteen voxels at once.
 
     basis  (K, 16) float32, scratch
@@ -243,7 +243,7 @@ def _colours(first, end, cascade, packed, direction, cone, density_scale, degree
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def compute_view_colours(first, end, cascade, packed, direction, cone, density_scale, degree, out):  # type: ignore[no-untyped-def]
+def compute_view_colours(first, end, cascade, packed, direction, cone, density_scale, degree, out):
     """Scaled density, and red, green and blue before the sigmoid, along `direction` (see `View`), of voxels first <= n < end of the packed order, all of one
     cascade, into out (N + 1, 4) uint16, the bits of half floats.
 

@@ -106,7 +106,7 @@ def packets_of(rays: int, side: int = 1) -> np.ndarray:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _fill_colours(basis, terms, sh, tree, packet):  # type: ignore[no-untyped-def]
+def _fill_colours(basis, terms, sh, tree, packet):
     """Sums of the harmonics of the slots at which samples lie, along the packet's mean direction; returns how many of these hold a voxel, see `stored`."""
     found, width = 0, 3 * terms
     for block in range(1, packet.state[BLOCKS]):
@@ -136,7 +136,7 @@ def _fill_colours(basis, terms, sh, tree, packet):  # type: ignore[no-untyped-de
 
 
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
-def _shade(n, packet):  # type: ignore[no-untyped-def]
+def _shade(n, packet):
     """Colour of a sample, sigmoids of what is interpolated between the corners that are stored; kept in `packet.shade`."""
     red, green, blue, total = mix_corners(packet.colour, packet.slots, packet.weights, 8 * n, 1, 4)
     inverse = cast_like(1, total) / total if total > 0 else 0 * total
@@ -146,7 +146,7 @@ def _shade(n, packet):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _composite_ray(ray, begin, end, left, targets, packet):  # type: ignore[no-untyped-def]
+def _composite_ray(ray, begin, end, left, targets, packet):
     """Differences of a ray's colour from its target; its samples are `begin` to `end`, behind which so much light is left."""
     light = packet.light
     red, green, blue = 0.0, 0.0, 0.0
@@ -165,7 +165,7 @@ def _composite_ray(ray, begin, end, left, targets, packet):  # type: ignore[no-u
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _add_structure(begin, end, targets, slopes):  # type: ignore[no-untyped-def]
+def _add_structure(begin, end, targets, slopes):
     """Half of the derivatives of structural dissimilarity by the colours of a patch, added to their differences `slopes` (16, 3)."""
     share = 1 / (end - begin)
     for channel in range(3):
@@ -190,7 +190,7 @@ def _add_structure(begin, end, targets, slopes):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _pull_ray(ray, begin, end, left, slopes, targets, packet):  # type: ignore[no-untyped-def]
+def _pull_ray(ray, begin, end, left, slopes, targets, packet):
     """Adds a ray's gradients to the slots; slopes: half of the loss's derivatives by its colour."""
     light, shade, kind = packet.light, packet.shade, targets.colour.dtype.type
     arriving = np.float64(targets.transmittance[ray])
@@ -213,12 +213,12 @@ def _pull_ray(ray, begin, end, left, slopes, targets, packet):  # type: ignore[n
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _ray_scratch(count):  # type: ignore[no-untyped-def]
+def _ray_scratch(count):
     return RayScratch(np.empty(count, np.int64), np.empty(count, np.float64), np.empty((count, 3), np.float64))
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _trace_packet(number, packets, targets, limits, sh, tree, arrays, rays, loss):  # type: ignore[no-untyped-def]
+def _trace_packet(number, packets, targets, limits, sh, tree, arrays, rays, loss):
     """Losses of the rays of a packet and the gradients of its slots; returns how many voxels it met, or -1 where there is no room.
 
     sh    pointer
@@ -252,7 +252,7 @@ def _trace_packet(number, packets, targets, limits, sh, tree, arrays, rays, loss
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _leave_records(number, found, written, arrays, numbers, gradient, bins):  # type: ignore[no-untyped-def]
+def _leave_records(number, found, written, arrays, numbers, gradient, bins):
     """Records of the voxels that a packet found, from `written` on, counted by bins; returns their end."""
     packet = packet_pointers(arrays)
     for n in range(found):
@@ -266,7 +266,7 @@ def _leave_records(number, found, written, arrays, numbers, gradient, bins):  # 
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _sort_records(written, numbers, gradient, begin, base, out_numbers, out_gradient, place):  # type: ignore[no-untyped-def]
+def _sort_records(written, numbers, gradient, begin, base, out_numbers, out_gradient, place):
     """Puts records in order of their bins, and within these as they were, from `base` on; begin: counts by bins after a zero, afterwards where bins begin."""
     begin[0] = base
     for n in range(1, len(begin)):
@@ -282,7 +282,7 @@ def _sort_records(written, numbers, gradient, begin, base, out_numbers, out_grad
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _enlarged(values, count, room):  # type: ignore[no-untyped-def]
+def _enlarged(values, count, room):
     """The first `count` rows in an array of `room`."""
     out = np.empty((room, values.shape[1]), values.dtype)
     for n in range(count):  # an assignment of slices would take three seconds to compile: its error's text
@@ -292,7 +292,7 @@ def _enlarged(values, count, room):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _work(task, cells, values, packets, targets, limits, numbers, gradient, begin, counts, loss):  # type: ignore[no-untyped-def]
+def _work(task, cells, values, packets, targets, limits, numbers, gradient, begin, counts, loss):
     """Takes chunks until none is left. Chunk u writes its records from u * capacity on, and to counts[u] how many there are; more than `capacity`: none."""
     first, density = packets.first, values.density
     tree, flat = tree_pointers(cells, density), pointer(values.sh)
@@ -322,7 +322,7 @@ def _work(task, cells, values, packets, targets, limits, numbers, gradient, begi
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _forward_backward(workers, task, cells, values, packets, targets, limits, numbers, gradient, begin, counts, loss):  # type: ignore[no-untyped-def]
+def _forward_backward(workers, task, cells, values, packets, targets, limits, numbers, gradient, begin, counts, loss):
     for _ in numba.prange(workers):
         _work(task, cells, values, packets, targets, limits, numbers, gradient, begin, counts, loss)
 

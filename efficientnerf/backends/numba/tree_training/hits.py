@@ -7,7 +7,7 @@ from efficientnerf.backends.numba.tree.march import box_distances
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _comes_near(ox, oy, oz, dx, dy, dz, leap):  # type: ignore[no-untyped-def]
+def _comes_near(ox, oy, oz, dx, dy, dz, leap):
     """Whether a ray, coordinates in coarse cells, meets a cell whose leap is 0."""
     nx, ny, nz = leap.shape
     t, end = box_distances(ox, oy, oz, dx, dy, dz, nx, ny, nz)
@@ -30,7 +30,7 @@ def _comes_near(ox, oy, oz, dx, dy, dz, leap):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def come_near(origins, directions, leap, found):  # type: ignore[no-untyped-def]
+def come_near(origins, directions, leap, found):
     """Whether rays (R, 3), unit directions and origins in coarse cells, meet a cell whose leap is 0, into `found` (R,) bool."""
     for n in numba.prange(len(origins)):
         found[n] = _comes_near(origins[n, 0], origins[n, 1], origins[n, 2], directions[n, 0], directions[n, 1], directions[n, 2], leap)

@@ -32,7 +32,7 @@ NO_NEIGHBOURS = Neighbours(np.zeros((0, 6), np.int32), 1)
 
 
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
-def _beyond(face, inside, place, owner, at, stride, cube, brick, dense, around):  # type: ignore[no-untyped-def]
+def _beyond(face, inside, place, owner, at, stride, cube, brick, dense, around):
     """Density of the voxel beyond a face of the one at a place, `inside` if it is in the same brick; -0 where none is stored."""
     ahead = stride if face & 1 else -stride
     if inside:
@@ -42,7 +42,7 @@ def _beyond(face, inside, place, owner, at, stride, cube, brick, dense, around):
 
 
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
-def _ratio(density, thickness, voxel, least):  # type: ignore[no-untyped-def]
+def _ratio(density, thickness, voxel, least):
     """Optical thickness over that of a neighbour of some density, as two numbers; 1 where none is stored."""
     if density > 0:
         return thickness, max(density * voxel, least)
@@ -50,7 +50,7 @@ def _ratio(density, thickness, voxel, least):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def differences(place, thickness, voxel, least, brick, dense, around):  # type: ignore[no-untyped-def]
+def differences(place, thickness, voxel, least, brick, dense, around):
     """Sum of the differences between the logarithm of the optical thickness of the voxel at a place and those of the voxels beyond its faces that are stored;
     these are at least `least`. dense, around: pointers."""
     area = brick * brick

@@ -50,7 +50,7 @@ BLOCKS, ENTRIES, SAMPLES = 0, 1, 2  # in `PacketArrays.state`
 
 
 @numba.njit(cache=True, error_model="numpy")
-def packet_arrays(most, samples, cube, density):  # type: ignore[no-untyped-def]
+def packet_arrays(most, samples, cube, density):
     """Memory with room for so many blocks and samples, nothing in use; numbers of the type of `density`."""
     slots, kind = most * cube, density.dtype
     arrays = PacketArrays(
@@ -64,7 +64,7 @@ def packet_arrays(most, samples, cube, density):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def packet_pointers(a):  # type: ignore[no-untyped-def]
+def packet_pointers(a):
     """The same with pointers."""
     return PacketArrays(
         a.most, a.samples, pointer(a.state), pointer(a.cell_table), pointer(a.cell_key), pointer(a.blocks), pointer(a.sources), pointer(a.brick_table),
@@ -74,14 +74,14 @@ def packet_pointers(a):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _hash(key, size):  # type: ignore[no-untyped-def]
+def _hash(key, size):
     """Where to look first in a table of `size`, a power of two."""
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     return np.int64(mixed >> np.uint64(40)) & (size - 1)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def clear(packet, tree):  # type: ignore[no-untyped-def]
+def clear(packet, tree):
     """Take everything out of a packet's memory."""
     for n in range(4 * packet.most):
         packet.cell_table[n] = np.int32(-1)
@@ -92,7 +92,7 @@ def clear(packet, tree):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _block(owner, tree, packet):  # type: ignore[no-untyped-def]
+def _block(owner, tree, packet):
     """The block of a brick; -1 where there is no room."""
     size = 4 * packet.most
     at = _hash(owner, size)
@@ -113,13 +113,13 @@ def _block(owner, tree, packet):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _key(a, b, c, cascade):  # type: ignore[no-untyped-def]
+def _key(a, b, c, cascade):
     """A number that stands for a coarse cell, from -1 on along each axis."""
     return ((np.int64(cascade) * 2**20 + a + 1) * 2**21 + b + 1) * 2**21 + c + 1
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _entry(key, a, b, c, cascade, tree, packet):  # type: ignore[no-untyped-def]
+def _entry(key, a, b, c, cascade, tree, packet):
     """The entry of a coarse cell, from -1 on along each axis, by its `_key`; made where it is new; -1 where there is no room."""
     nx, ny, nz = tree.shape[3 * cascade], tree.shape[3 * cascade + 1], tree.shape[3 * cascade + 2]
     size = 4 * packet.most
@@ -148,14 +148,14 @@ def _entry(key, a, b, c, cascade, tree, packet):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _along(x, brick, stride):  # type: ignore[no-untyped-def]
+def _along(x, brick, stride):
     """Offsets of voxels x and x + 1 of a brick along an axis, and whether the second one lies in the next brick."""
     beyond = x + 1 == brick
     return x * stride, 0 if beyond else (x + 1) * stride, beyond
 
 
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
-def _place(n, entry, brick, offset, weight, at, tree, packet):  # type: ignore[no-untyped-def]
+def _place(n, entry, brick, offset, weight, at, tree, packet):
     """Slot and weight of corner n of the sample that begins at `at`, in one of the eight bricks of an entry; returns its share of the density."""
     packet.slots[at + n] = np.int32(packet.blocks[8 * entry + brick] + offset)
     packet.weights[at + n] = weight
@@ -163,7 +163,7 @@ def _place(n, entry, brick, offset, weight, at, tree, packet):  # type: ignore[n
 
 
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
-def _interpolated(entry, x, y, z, fx, fy, fz, at, tree, packet):  # type: ignore[no-untyped-def]
+def _interpolated(entry, x, y, z, fx, fy, fz, at, tree, packet):
     """Density between the voxel (x, y, z) of an entry's cell and the seven beyond it; slots and weights from `at` on."""
     brick = tree.brick
     x0, x1, bx = _along(x, brick, brick * brick)
@@ -185,7 +185,7 @@ def _interpolated(entry, x, y, z, fx, fy, fz, at, tree, packet):  # type: ignore
 
 
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
-def _add(point, cell, cascade, tree, packet, state):  # type: ignore[no-untyped-def]
+def _add(point, cell, cascade, tree, packet, state):
     """Adds a sample that has density to a packet.
 
     state  transmittance, or -1 where there is no room; number of samples; entry that the last one lay in, and its key
@@ -221,7 +221,7 @@ def _add(point, cell, cascade, tree, packet, state):  # type: ignore[no-untyped-
 
 
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
-def _add_sample(point, cell, t, cascade, tree, scene, state):  # type: ignore[no-untyped-def]
+def _add_sample(point, cell, t, cascade, tree, scene, state):
     """`_add` for `march_with`; scene: a tuple of the packet."""
     # numba takes for dead what is written to a structure that comes out of a tuple: here it is an argument.
     return _add(point, cell, cascade, tree, scene[0], state)
@@ -231,7 +231,7 @@ _march = march_with(_add_sample)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def clear_distance(begin, end, origins, directions, tree):  # type: ignore[no-untyped-def]
+def clear_distance(begin, end, origins, directions, tree):
     """Distance before which none of these rays meets an occupied cell: steps of the ray in their middle, less what they stray from it; of one cascade."""
     if tree.cascades > 1 or end - begin < 2:
         return 0.0
@@ -262,7 +262,7 @@ def clear_distance(begin, end, origins, directions, tree):  # type: ignore[no-un
 
 
 @numba.njit(cache=True, error_model="numpy")
-def walk_ray(origin, direction, clear, tree, stop, packet):  # type: ignore[no-untyped-def]
+def walk_ray(origin, direction, clear, tree, stop, packet):
     """Adds the samples of a ray that have density to a packet; returns the transmittance behind all of them, or -1 where there is no room.
 
     clear  distance before which the ray meets nothing

@@ -95,7 +95,7 @@ class StepPointers(NamedTuple):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _link(low, chunks, slab, records, head, following, some):  # type: ignore[no-untyped-def]
+def _link(low, chunks, slab, records, head, following, some):
     """Lists of the records of each voxel of a bin, in their order: head[v - low], and following[n], where n counts the records of the bin; a bit of `some` for
     each voxel that has any."""
     number = 0
@@ -114,7 +114,7 @@ def _link(low, chunks, slab, records, head, following, some):  # type: ignore[no
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _link_all(low, slab, records, head, following, some):  # type: ignore[no-untyped-def]
+def _link_all(low, slab, records, head, following, some):
     """`_link` with as much room as it needs: `following`, or a larger one."""
     more = _link(low, records.begin.shape[0], slab, records, head, following, some)
     if more > 0:
@@ -124,7 +124,7 @@ def _link_all(low, slab, records, head, following, some):  # type: ignore[no-unt
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _take_voxels(some, met):  # type: ignore[no-untyped-def]
+def _take_voxels(some, met):
     """Numbers of the bits that are set, into `met`; returns how many, and sets none."""
     count = 0
     for word in range(len(some)):
@@ -138,7 +138,7 @@ def _take_voxels(some, met):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _gather(number, p):  # type: ignore[no-untyped-def]
+def _gather(number, p):
     """Sum of the records of a list into `p.row`; returns that by density, and the sum of the squares of the row."""
     by_density, squares, n = 0.0, broadcast(np.float32(0), LANES), number
     while n >= 0:
@@ -157,7 +157,7 @@ def _gather(number, p):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _update(v, by_density, squares, p, h):  # type: ignore[no-untyped-def]
+def _update(v, by_density, squares, p, h):
     """A step of one voxel, whose gradient by coefficients is `p.row` and the sum of its squares `squares`."""
     decay, epsilon = h.decay, h.epsilon
     visits = np.int64(min(p.visits[v] + 1, MAX_VISITS))
@@ -183,7 +183,7 @@ def _update(v, by_density, squares, p, h):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
-def _fetch(v, number, p):  # type: ignore[no-untyped-def]
+def _fetch(v, number, p):
     """Bring what a step of a voxel with such a first record reads into the caches."""
     prefetch(p.density, v)
     prefetch(p.square_density, v)
@@ -197,7 +197,7 @@ def _fetch(v, number, p):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _step_pointers(records, rows, following, row, values, moments, neighbours, rates, of_square):  # type: ignore[no-untyped-def]
+def _step_pointers(records, rows, following, row, values, moments, neighbours, rates, of_square):
     """See `StepPointers`."""
     return StepPointers(
         pointer(records.numbers), pointer(records.gradient), pointer(rows), pointer(following), pointer(row), values.sh.shape[1], rows.shape[1],
@@ -208,7 +208,7 @@ def _step_pointers(records, rows, following, row, values, moments, neighbours, r
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_square):  # type: ignore[no-untyped-def]
+def _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_square):
     """Takes bins until none is left."""
     bins, size = records.begin.shape[1] - 1, 1 << BIN_BITS
     met, some, row = np.empty(size, np.int64), np.zeros(size >> 6, np.int64), np.empty(rows.shape[1], np.float32)
@@ -232,13 +232,13 @@ def _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_sq
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _step(workers, task, records, rows, values, moments, neighbours, h, rates, of_square):  # type: ignore[no-untyped-def]
+def _step(workers, task, records, rows, values, moments, neighbours, h, rates, of_square):
     for _ in numba.prange(workers):
         _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_square)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _copy_bins(task, records, values):  # type: ignore[no-untyped-def]
+def _copy_bins(task, records, values):
     """Copies the densities of voxels that have records to where rays find them, until no bin is left."""
     bins, chunks = records.begin.shape[1] - 1, records.begin.shape[0]
     slab = fetch_add(pointer(task), 0, 1)
@@ -251,7 +251,7 @@ def _copy_bins(task, records, values):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _copy(workers, task, records, values):  # type: ignore[no-untyped-def]
+def _copy(workers, task, records, values):
     for _ in numba.prange(workers):
         _copy_bins(task, records, values)
 

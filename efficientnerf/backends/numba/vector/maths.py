@@ -25,13 +25,13 @@ def broadcast(typing_context: Any, value: Any, count: Any) -> Any:
     return vector(kind, count), lambda context, builder, signature, args: spread(builder, args[0], kind, vector.count)
 
 
-def broadcast_like(value, other):  # type: ignore[no-untyped-def]
+def broadcast_like(value, other):
     """The scalar `value`, or a vector of it where `other` is one."""
     raise NotImplementedError("inside kernels only")
 
 
 @overload(broadcast_like)
-def _broadcast_like(value, other):  # type: ignore[no-untyped-def]
+def _broadcast_like(value, other):
     if not isinstance(other, Vector):
         return lambda value, other: value
     count = other.count
@@ -152,14 +152,14 @@ def sigmoid(typing_context: Any, value: Any) -> Any:
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def exp(x):  # type: ignore[no-untyped-def]
+def exp(x):
     """e^x of a vector of float32 for x from -80 to 80."""
     y = x * LOG2_E
     return exp2_neg(maximum(y * np.float32(-1), _NONE)) / exp2_neg(maximum(y, _NONE))
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def arctangent(t):  # type: ignore[no-untyped-def]
+def arctangent(t):
     """Arc tangent of a vector of float32 t >= 0, to 3e-7."""
     steep = t > _ONE
     x = select(steep, _ONE / maximum(t, np.float32(1e-30)), t)

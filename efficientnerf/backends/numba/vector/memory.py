@@ -97,14 +97,14 @@ def store(typing_context: Any, address: Any, index: Any, value: Any) -> Any:
     return types.void(address, types.int64, value), codegen
 
 
-def store_nth(out, n, value):  # type: ignore[no-untyped-def]
+def store_nth(out, n, value):
     """out[n] = value, a scalar; or a vector, the n-th of those that lie end to end."""
     raise NotImplementedError("inside kernels only")
 
 
 @overload(store_nth)
-def _store_nth(out, n, value):  # type: ignore[no-untyped-def]
-    def scalar(out, n, value):  # type: ignore[no-untyped-def]
+def _store_nth(out, n, value):
+    def scalar(out, n, value):
         out[n] = value
 
     if not isinstance(value, Vector):

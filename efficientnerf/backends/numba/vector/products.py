@@ -202,25 +202,25 @@ _product_plain, _product_added, _product_relu, _product_masked = (_product(finis
 
 
 @numba.njit(cache=True, error_model="numpy")
-def product(a, b, c, count, rows, columns):  # type: ignore[no-untyped-def]
+def product(a, b, c, count, rows, columns):
     """c = a b."""
     _product_plain(a, b, c, count, rows, columns, c.data, c.start)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def product_added(a, b, c, count, rows, columns):  # type: ignore[no-untyped-def]
+def product_added(a, b, c, count, rows, columns):
     """c += a b."""
     _product_added(a, b, c, count, rows, columns, c.data, c.start)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def product_relu(a, b, c, count, rows, columns):  # type: ignore[no-untyped-def]
+def product_relu(a, b, c, count, rows, columns):
     """c = ReLU(a b)."""
     _product_relu(a, b, c, count, rows, columns, c.data, c.start)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def product_masked(a, b, c, count, rows, columns, mask, mask_start):  # type: ignore[no-untyped-def]
+def product_masked(a, b, c, count, rows, columns, mask, mask_start):
     """c = a b where `mask` is not zero, else 0; mask[r, n] lies at mask[mask_start + r c.row + n]."""
     _product_masked(a, b, c, count, rows, columns, mask, mask_start)
 
@@ -282,7 +282,7 @@ def transpose16(typing_context: Any, source: Any, at: Any, row: Any, target: Any
     return types.void(source, n, n, target, n, n), codegen
 
 
-def pack_row_pairs(source, width, target, count, padded_width):  # type: ignore[no-untyped-def]
+def pack_row_pairs(source, width, target, count, padded_width):
     """Pairs of rows 2 n and 2 n + 1 of `source` (Rows of `width`, float32 or int16) to row n < count of `target`, a pointer to int32; to float32, a copy.
 
     padded_width  row length of the target, a multiple of LANES; source is read up to it, and zeros are written from `width` on
@@ -291,13 +291,13 @@ def pack_row_pairs(source, width, target, count, padded_width):  # type: ignore[
 
 
 @overload(pack_row_pairs)
-def _pack_row_pairs(source, width, target, count, padded_width):  # type: ignore[no-untyped-def]
-    def copy(source, width, target, count, padded_width):  # type: ignore[no-untyped-def]
+def _pack_row_pairs(source, width, target, count, padded_width):
+    def copy(source, width, target, count, padded_width):
         for line in range(count):
             for n in range(0, padded_width, LANES):
                 copy16(source.data, source.start + line * source.row + n, width - n, target, line * padded_width + n)
 
-    def pack(source, width, target, count, padded_width):  # type: ignore[no-untyped-def]
+    def pack(source, width, target, count, padded_width):
         for line in range(count):
             low = source.start + 2 * line * source.row
             for n in range(0, padded_width, LANES):
@@ -307,7 +307,7 @@ def _pack_row_pairs(source, width, target, count, padded_width):  # type: ignore
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def copy_rows(source, width, target, count, padded_width):  # type: ignore[no-untyped-def]
+def copy_rows(source, width, target, count, padded_width):
     """As `pack_row_pairs`, without pairing: float32 rows to a pointer to float32, or as bfloat16 to a pointer to int16."""
     for line in range(count):
         for n in range(0, padded_width, LANES):

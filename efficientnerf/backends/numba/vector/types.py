@@ -74,7 +74,7 @@ def _overload(operation: Any, emits: dict[Any, Any], *, compares: bool = False) 
         return (vector.of(types.boolean) if compares else vector)(a, b), codegen
 
     @overload(operation)
-    def implementation(a, b):  # type: ignore[no-untyped-def]
+    def implementation(a, b):
         vector = vector_among(a, b)
         if vector is not None and vector.element in emits and vector.takes(a) and vector.takes(b):
             return lambda a, b: elementwise(a, b)
@@ -108,5 +108,5 @@ def _inverted(typing_context: Any, mask: Any) -> Any:
 
 
 @overload(operator.invert)
-def _invert(mask):  # type: ignore[no-untyped-def]
+def _invert(mask):
     return (lambda mask: _inverted(mask)) if isinstance(mask, Vector) and mask.element == types.boolean else None

@@ -63,17 +63,17 @@ class Conic(NamedTuple):
 
 
 @triton.jit
-def _clamped(x, low, high):  # type: ignore[no-untyped-def]
+def _clamped(x, low, high):
     return tl.minimum(tl.maximum(x, low), high)
 
 
 @triton.jit
-def _dot(a, b):  # type: ignore[no-untyped-def]
+def _dot(a, b):
     return a.x * b.x + a.y * b.y + a.z * b.z
 
 
 @triton.jit
-def _arctangent(t):  # type: ignore[no-untyped-def]
+def _arctangent(t):
     """Of t >= 0, to 3e-7."""
     x = tl.where(t > 1, 1 / tl.maximum(t, 1e-30), t)
     x = x / (1 + tl.sqrt(1 + x * x))
@@ -85,7 +85,7 @@ def _arctangent(t):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _plane(x, y, z, lens, FISHEYE: tl.constexpr):  # type: ignore[no-untyped-def]
+def _plane(x, y, z, lens, FISHEYE: tl.constexpr):
     """Points of the camera on the undistorted plane (u, v), whether each can be seen there, and the derivatives of u and v (Vec3), kept within the limits."""
     nearest = lens.numbers[13]
     if FISHEYE:
@@ -110,7 +110,7 @@ def _plane(x, y, z, lens, FISHEYE: tl.constexpr):  # type: ignore[no-untyped-def
 
 
 @triton.jit
-def _distorted(u, v, n):  # type: ignore[no-untyped-def]
+def _distorted(u, v, n):
     """Points of the undistorted plane, distorted by the numbers of a lens, and the derivative: x_u, x_v and y_u, y_v."""
     s = u * u + v * v
     top = ((s * n[7] + n[6]) * s + n[5]) * s + n[4]
@@ -127,19 +127,19 @@ def _distorted(u, v, n):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _chained(u, v, by_u, by_v):  # type: ignore[no-untyped-def]
+def _chained(u, v, by_u, by_v):
     """u by_u + v by_v"""
     return Vec3(u * by_u.x + v * by_v.x, u * by_u.y + v * by_v.y, u * by_u.z + v * by_v.z)
 
 
 @triton.jit
-def _in_world(j, t):  # type: ignore[no-untyped-def]
+def _in_world(j, t):
     """A derivative by the point of the camera as one by that of the world; t: rows of the rotation between them."""
     return Vec3(j.x * t[0] + j.y * t[3] + j.z * t[6], j.x * t[1] + j.y * t[4] + j.z * t[7], j.x * t[2] + j.y * t[5] + j.z * t[8])
 
 
 @triton.jit
-def _along_axes(d, w, x, y, z):  # type: ignore[no-untyped-def]
+def _along_axes(d, w, x, y, z):
     """A derivative by the point of the world as those along the axes of the rotation of a unit quaternion."""
     return Vec3(
         d.x * (1 - 2 * (y * y + z * z)) + d.y * 2 * (x * y + w * z) + d.z * 2 * (x * z - w * y),
@@ -149,14 +149,14 @@ def _along_axes(d, w, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def load_rows(values, row, n, count, live):  # type: ignore[no-untyped-def]
+def load_rows(values, row, n, count, live):
     """Three rows from `row` on (Vec3)."""
     at = values + count * row + n
     return Vec3(tl.load(at, live, other=0.0), tl.load(at + count, live, other=0.0), tl.load(at + 2 * count, live, other=0.0))
 
 
 @triton.jit
-def image_of(values, n, count, live, lens, FISHEYE: tl.constexpr):  # type: ignore[no-untyped-def]
+def image_of(values, n, count, live, lens, FISHEYE: tl.constexpr):
     """Gaussians n in the image, as Projected."""
     t, k, mean = lens.turn, lens.numbers, load_rows(values, MEAN, n, count, live)
     a, b, c = mean.x - lens.centre[0], mean.y - lens.centre[1], mean.z - lens.centre[2]
@@ -184,7 +184,7 @@ def image_of(values, n, count, live, lens, FISHEYE: tl.constexpr):  # type: igno
 
 
 @triton.jit
-def conic_of(p):  # type: ignore[no-untyped-def]
+def conic_of(p):
     """The Conic of Projected."""
     ax = Vec3(p.turned_x.x * p.scales.x, p.turned_x.y * p.scales.y, p.turned_x.z * p.scales.z)
     ay = Vec3(p.turned_y.x * p.scales.x, p.turned_y.y * p.scales.y, p.turned_y.z * p.scales.z)
@@ -196,7 +196,7 @@ def conic_of(p):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def colour_of(values, n, count, live, lens, K: tl.constexpr):  # type: ignore[no-untyped-def]
+def colour_of(values, n, count, live, lens, K: tl.constexpr):
     """Unit directions that harmonics are seen along, and colours, not clipped (Vec3)."""
     mean = load_rows(values, MEAN, n, count, live)
     x, y, z = mean.x - lens.centre[0], mean.y - lens.centre[1], mean.z - lens.centre[2]
@@ -210,14 +210,14 @@ def colour_of(values, n, count, live, lens, K: tl.constexpr):  # type: ignore[no
 
 
 @triton.jit
-def _range(centre, reach, cells):  # type: ignore[no-untyped-def]
+def _range(centre, reach, cells):
     """First tile that centre - reach to centre + reach meets, and how many."""
     first = tl.maximum((centre - reach) / TILE, 0.0).to(tl.int32)
     return first, tl.maximum(tl.minimum((centre + reach) / TILE, cells - 1.0).to(tl.int32) + 1 - first, 0)
 
 
 @triton.jit(do_not_specialize=["count"])
-def project(values, records, boxes, count, lens, FISHEYE: tl.constexpr, K: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+def project(values, records, boxes, count, lens, FISHEYE: tl.constexpr, K: tl.constexpr, BLOCK: tl.constexpr):
     """Records (N, RECORD) float32, and boxes (4, N) int32: column and row of the first tile, columns, and tiles in all, 0 of what is not in the image."""
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = n < count

@@ -69,7 +69,7 @@ class Chunk(NamedTuple):
 
 
 @triton.jit
-def _block(pairs, width, height):  # type: ignore[no-untyped-def]
+def _block(pairs, width, height):
     tile, part, pixel = tl.program_id(0), tl.program_id(1), tl.arange(0, SIDE * SIDE)
     i = tile // pairs.columns * TILE + part // (TILE // SIDE) * SIDE + pixel // SIDE
     j = tile % pairs.columns * TILE + part % (TILE // SIDE) * SIDE + pixel % SIDE
@@ -77,7 +77,7 @@ def _block(pairs, width, height):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _chunk(records, pairs, block, base, through):  # type: ignore[no-untyped-def]
+def _chunk(records, pairs, block, base, through):
     """The pairs from `base` on, behind those that let `through` (P,) pass."""
     n = base + tl.arange(0, CHUNK)
     live = n < block.end
@@ -98,7 +98,7 @@ def _chunk(records, pairs, block, base, through):  # type: ignore[no-untyped-def
 
 
 @triton.jit
-def _blend(records, pairs, block):  # type: ignore[no-untyped-def]
+def _blend(records, pairs, block):
     """Colour (Vec3) and transmittance of a block, and where the first chunk begins that no pixel needs."""
     through = tl.where(block.inside, 1.0, 0.0)
     light = tl.zeros_like(through) + 1
@@ -117,7 +117,7 @@ def _blend(records, pairs, block):  # type: ignore[no-untyped-def]
 
 
 @triton.jit(do_not_specialize=["width", "height"])
-def render_tiles(records, pairs, colour, transmittance, width, height):  # type: ignore[no-untyped-def]
+def render_tiles(records, pairs, colour, transmittance, width, height):
     """Colour (H, W, 3) and transmittance (H, W)."""
     block = _block(pairs, width, height)
     found, light, _ = _blend(records, pairs, block)
@@ -129,7 +129,7 @@ def render_tiles(records, pairs, colour, transmittance, width, height):  # type:
 
 
 @triton.jit
-def _slope(found, light, at, counts, picture, CHANNEL: tl.constexpr, OVER_ALL: tl.constexpr):  # type: ignore[no-untyped-def]
+def _slope(found, light, at, counts, picture, CHANNEL: tl.constexpr, OVER_ALL: tl.constexpr):
     """Half of the squared error's derivative by a channel, what that adds to the one by the transmittance, the error, and the colour wanted, over grey or the
     background."""
     wanted = tl.load(picture.pixels + 4 * at + CHANNEL, counts, other=0).to(tl.float32) * (1 / 255)
@@ -145,7 +145,7 @@ def _slope(found, light, at, counts, picture, CHANNEL: tl.constexpr, OVER_ALL: t
 
 
 @triton.jit
-def _window_mean(x):  # type: ignore[no-untyped-def]
+def _window_mean(x):
     """The mean over each pixel's window."""
     windows = tl.reshape(x, (SIDE // WINDOW, WINDOW, SIDE // WINDOW, WINDOW))
     mean = tl.sum(tl.sum(windows, 3, keep_dims=True), 1, keep_dims=True) / (WINDOW * WINDOW)
@@ -153,7 +153,7 @@ def _window_mean(x):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _structure_slope(difference, y, whole, weight):  # type: ignore[no-untyped-def]
+def _structure_slope(difference, y, whole, weight):
     """Half of the derivative of structural dissimilarity by a channel of pixels whose window is `whole`."""
     x = y + difference
     of_x, of_y = _window_mean(x), _window_mean(y)
@@ -165,7 +165,7 @@ def _structure_slope(difference, y, whole, weight):  # type: ignore[no-untyped-d
 
 
 @triton.jit
-def _slopes(found, light, at, counts, whole, picture, CHANNEL: tl.constexpr, OVER_ALL: tl.constexpr):  # type: ignore[no-untyped-def]
+def _slopes(found, light, at, counts, whole, picture, CHANNEL: tl.constexpr, OVER_ALL: tl.constexpr):
     """`_slope` with structure: half of the derivatives by a channel and by the transmittance, and the squared error."""
     slope, by_light, error, wanted = _slope(found, light, at, counts, picture, CHANNEL, OVER_ALL)
     change = _structure_slope(slope, wanted, whole, picture.structure)
@@ -176,7 +176,7 @@ def _slopes(found, light, at, counts, whole, picture, CHANNEL: tl.constexpr, OVE
 
 
 @triton.jit
-def _pull(c, by, error, sums, v):  # type: ignore[no-untyped-def]
+def _pull(c, by, error, sums, v):
     """Add the sums of a chunk to its Gaussians'; v: derivatives by -q / 2."""
     weight, to, vx, vy = tl.where(c.counts, c.before * c.alpha, 0.0), sums + c.gaussian * SUMS, v * c.dx, v * c.dy
     met = tl.max(c.counts.to(tl.int32), 1) > 0
@@ -193,7 +193,7 @@ def _pull(c, by, error, sums, v):  # type: ignore[no-untyped-def]
 
 
 @triton.jit(do_not_specialize=["width", "height"])
-def fit_tiles(records, pairs, picture, sums, width, height, OVER_ALL: tl.constexpr):  # type: ignore[no-untyped-def]
+def fit_tiles(records, pairs, picture, sums, width, height, OVER_ALL: tl.constexpr):
     """Sums of half of the error's derivatives added to `sums` (N, SUMS)."""
     block = _block(pairs, width, height)
     found, light, last = _blend(records, pairs, block)

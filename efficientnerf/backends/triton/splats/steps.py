@@ -44,7 +44,7 @@ class Walk(NamedTuple):
 
 
 @triton.jit
-def _scale(walk, PART: tl.constexpr, square, rate):  # type: ignore[no-untyped-def]
+def _scale(walk, PART: tl.constexpr, square, rate):
     """What running means of gradients are multiplied by, with the mean `square` of those of a part taken in."""
     at = walk.moment + walk.count * (SQUARES + PART)
     mean = tl.load(at, walk.moves, other=0.0) * walk.rule.decay + square * (1 - walk.rule.decay)
@@ -53,7 +53,7 @@ def _scale(walk, PART: tl.constexpr, square, rate):  # type: ignore[no-untyped-d
 
 
 @triton.jit
-def _descend(walk, row, gradient, scale):  # type: ignore[no-untyped-def]
+def _descend(walk, row, gradient, scale):
     """The step of a row; returns its values."""
     at, to = walk.moment + walk.count * (GRADIENTS + row), walk.value + walk.count * row
     mean = tl.load(at, walk.moves, other=0.0) * walk.rule.momentum + gradient * (1 - walk.rule.momentum)
@@ -64,14 +64,14 @@ def _descend(walk, row, gradient, scale):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _descend_three(walk, row, PART: tl.constexpr, g, rate):  # type: ignore[no-untyped-def]
+def _descend_three(walk, row, PART: tl.constexpr, g, rate):
     """The step of a part of three rows, with gradients g (Vec3)."""
     scale = _scale(walk, PART, (g.x * g.x + g.y * g.y + g.z * g.z) / 3, rate)
     return Vec3(_descend(walk, row, g.x, scale), _descend(walk, row + 1, g.y, scale), _descend(walk, row + 2, g.z, scale))
 
 
 @triton.jit
-def _by_covariance(conic, sums):  # type: ignore[no-untyped-def]
+def _by_covariance(conic, sums):
     """Derivatives by the root of the covariance in the image, its two rows (Vec3): half of Q V Q, Q the conic, twice, times the root."""
     a, b, c = conic.a, conic.b, conic.c
     vxx, vxy, vyy = sums
@@ -83,7 +83,7 @@ def _by_covariance(conic, sums):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _turn(walk, p, dx, dy):  # type: ignore[no-untyped-def]
+def _turn(walk, p, dx, dy):
     """The step of the quaternions, by derivatives of the covariance's root."""
     wx, wy, s = p.by_x, p.by_y, p.scales
     g00, g01, g02 = (wx.x * dx.x + wy.x * dy.x) * s.x, (wx.x * dx.y + wy.x * dy.y) * s.y, (wx.x * dx.z + wy.x * dy.z) * s.z
@@ -104,7 +104,7 @@ def _turn(walk, p, dx, dy):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _colour(walk, view, g, K: tl.constexpr):  # type: ignore[no-untyped-def]
+def _colour(walk, view, g, K: tl.constexpr):
     """The step of the harmonics, with gradients g (Vec3) by the colours, none by one that is clipped."""
     base = harmonic(view, 0)
     _descend_three(walk, HARMONICS, 4, Vec3(base * g.x, base * g.y, base * g.z), walk.rule.rates[4])
@@ -122,7 +122,7 @@ def _colour(walk, view, g, K: tl.constexpr):  # type: ignore[no-untyped-def]
 
 
 @triton.jit(do_not_specialize=["count", "shift"])
-def step(  # type: ignore[no-untyped-def]
+def step(
     values, moments, errors, sums, tiles, count, lens, rule, draws, shift, FISHEYE: tl.constexpr, K: tl.constexpr, BLOCK: tl.constexpr
 ):  # fmt: skip
     """A step of the Gaussians that are in tiles, and their part in the error added to `errors` (N,); sums (N, SUMS) are of `raster.fit_tiles`, draws and shift

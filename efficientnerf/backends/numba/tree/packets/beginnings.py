@@ -41,7 +41,7 @@ MARGIN = 1 / 16  # voxels that rounding may put the ends of a ray outside of the
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _near_and_far(o, d, inverse, most, t0, t1):  # type: ignore[no-untyped-def]
+def _near_and_far(o, d, inverse, most, t0, t1):
     """Distances t0 and t1 between which rays are in a box, and between 0 and `most` along an axis too; exit before entry where they never are."""
     moves, low, high = (d != 0.0), o * -1.0 * inverse, (most - o) * inverse
     within = select((o >= 0.0) & (o <= most), t1, -1.0)
@@ -49,14 +49,14 @@ def _near_and_far(o, d, inverse, most, t0, t1):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _in_box(x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
+def _in_box(x, y, z, nx, ny, nz):
     """Which points lie in the box from 0 to (nx, ny, nz), but for rounding; what is not finite does not."""
     inside = (x >= -MARGIN) & (x <= nx + MARGIN) & (y >= -MARGIN) & (y <= ny + MARGIN)
     return inside & (z >= -MARGIN) & (z <= nz + MARGIN)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _origins(ratio, shift_x, shift_y, shift_z, rays, places):  # type: ignore[no-untyped-def]
+def _origins(ratio, shift_x, shift_y, shift_z, rays, places):
     """Where rays begin, voxel coordinates of a cascade."""
     if rays.kind == PINHOLE:
         return broadcast(rays.x / ratio + shift_x, LANES), broadcast(rays.y / ratio + shift_y, LANES), broadcast(rays.z / ratio + shift_z, LANES)
@@ -65,7 +65,7 @@ def _origins(ratio, shift_x, shift_y, shift_z, rays, places):  # type: ignore[no
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _lay_out_pinhole(tile, rays, floats, places):  # type: ignore[no-untyped-def]
+def _lay_out_pinhole(tile, rays, floats, places):
     """Directions and cosines of a pinhole camera's rays."""
     across, lane = np.float64(tile.last - tile.first), lane_numbers(LANES)
     row = floor((lane + 0.5) / across)
@@ -86,7 +86,7 @@ def _lay_out_pinhole(tile, rays, floats, places):  # type: ignore[no-untyped-def
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _lay_out_rays(tile, rays, floats, places):  # type: ignore[no-untyped-def]
+def _lay_out_rays(tile, rays, floats, places):
     """Origins, directions and cosines of other rays."""
     row, column = tile.upper, tile.first
     for lane in range((tile.lower - tile.upper) * (tile.last - tile.first)):
@@ -104,7 +104,7 @@ def _lay_out_rays(tile, rays, floats, places):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def begin_rays(tile, rays, scene, scratch):  # type: ignore[no-untyped-def]
+def begin_rays(tile, rays, scene, scratch):
     """Lays out the rays of a tile's subdivision, which have met nothing, and where they enter and leave each cascade; returns their number."""
     floats, places, none = scratch.floats, scratch.rays, broadcast(np.float32(0), LANES)
     for n in range(TRANSMITTANCE, BASIS, LANES):
@@ -134,7 +134,7 @@ def begin_rays(tile, rays, scene, scratch):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _part_of(part, places):  # type: ignore[no-untyped-def]
+def _part_of(part, places):
     """Distances at which rays' parts in a cascade begin and end, voxels of it: see `efficientnerf.asset.rendering.ray_parts`."""
     at = ENDS + 2 * LANES * abs(part)
     t0, t1 = load(places, at, LANES), load(places, at + LANES, LANES)
@@ -149,7 +149,7 @@ def _part_of(part, places):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def begin_part(part, count, clear, grid, step, rays, scratch):  # type: ignore[no-untyped-def]
+def begin_part(part, count, clear, grid, step, rays, scratch):
     """Lays out the parts of rays in a cascade, their beginnings rounded to float32 as the samples are; returns whether there are any."""
     floats, places, none = scratch.floats, scratch.rays, np.float32(0)
     nx, ny, nz = np.float64(grid.nx * grid.brick), np.float64(grid.ny * grid.brick), np.float64(grid.nz * grid.brick)

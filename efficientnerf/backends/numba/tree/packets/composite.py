@@ -44,7 +44,7 @@ _LEAST = np.float32(1e-30)  # weight of stored voxels below which a sample has n
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _weigh(n, first, mask, edge, bit, fz, gz, floats, ints):  # type: ignore[no-untyped-def]
+def _weigh(n, first, mask, edge, bit, fz, gz, floats, ints):
     """The first voxel of row n, and weights of it and of the next; returns their sum.
 
     bit  of the first voxel in the mask; voxels that are not stored have no weight, and what lies in their place is any voxel beside them
@@ -56,7 +56,7 @@ def _weigh(n, first, mask, edge, bit, fz, gz, floats, ints):  # type: ignore[no-
 
 
 @numba.njit(cache=True, error_model="numpy")
-def locate(x, y, z, distance, owner, grid, colours, ints, batch, voxels):  # type: ignore[no-untyped-def]
+def locate(x, y, z, distance, owner, grid, colours, ints, batch, voxels):
     """Which voxels are around a sample of each ray of a packet, and their weights, into a batch; asks for their colours, which `blend` needs later.
 
     x, y, z  in the block of the brick `owner`
@@ -85,7 +85,7 @@ def locate(x, y, z, distance, owner, grid, colours, ints, batch, voxels):  # typ
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _evaluate_basis(view, floats, ints):  # type: ignore[no-untyped-def]
+def _evaluate_basis(view, floats, ints):
     """Harmonics of the rays' directions, once."""
     if ints[HAS_BASIS] == 0:
         sh_basis(load(floats, SH_X, LANES), load(floats, SH_Y, LANES), load(floats, SH_Z, LANES), view.degree, advanced(floats, BASIS))
@@ -93,7 +93,7 @@ def _evaluate_basis(view, floats, ints):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _colours_along(voxel, entry, grid, view, floats):  # type: ignore[no-untyped-def]
+def _colours_along(voxel, entry, grid, view, floats):
     """Density, red, green and blue of a voxel along each of the rays, into an entry of the cache."""
     y = load(floats, BASIS, LANES)
     if grid.coded:
@@ -114,7 +114,7 @@ def _colours_along(voxel, entry, grid, view, floats):  # type: ignore[no-untyped
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _mix_cached(lane, grid, view, floats, ints, batch, voxels):  # type: ignore[no-untyped-def]
+def _mix_cached(lane, grid, view, floats, ints, batch, voxels):
     """`_mix_view_colours` by the harmonics of voxels along the rays: those that rays which are neighbours share are summed once for all of them."""
     total = pack((_NONE, _NONE, _NONE, _NONE))
     for n in range(8):
@@ -129,7 +129,7 @@ def _mix_cached(lane, grid, view, floats, ints, batch, voxels):  # type: ignore[
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _mix_harmonics(lane, grid, view, floats, batch, voxels):  # type: ignore[no-untyped-def]
+def _mix_harmonics(lane, grid, view, floats, batch, voxels):
     """The same for rays that share nothing, and the weight of the colour; none is looked up until that is MIN_COLOUR_WEIGHT."""
     sigma = red = green = blue = _NONE
     for n in range(8):
@@ -152,7 +152,7 @@ def _mix_harmonics(lane, grid, view, floats, batch, voxels):  # type: ignore[no-
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _half_distances(lanes, sigma, view, floats, batch):  # type: ignore[no-untyped-def]
+def _half_distances(lanes, sigma, view, floats, batch):
     """Distances at which the transmittance of some rays, given as bits, falls to one half, within their samples."""
     store(floats, SAMPLE, sigma)
     while lanes != 0:
@@ -163,7 +163,7 @@ def _half_distances(lanes, sigma, view, floats, batch):  # type: ignore[no-untyp
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _mix_near(near, shared, grid, view, floats, ints, batch, voxels):  # type: ignore[no-untyped-def]
+def _mix_near(near, shared, grid, view, floats, ints, batch, voxels):
     """Weighted densities and colours of some rays' samples, given as bits, by harmonics, into SAMPLE."""
     _evaluate_basis(view, floats, ints)
     while near != 0:
@@ -175,7 +175,7 @@ def _mix_near(near, shared, grid, view, floats, ints, batch, voxels):  # type: i
 
 
 @numba.njit(cache=True, error_model="numpy")
-def blend(ready, near, shared, grid, view, colours, floats, ints, batch, voxels):  # type: ignore[no-untyped-def]
+def blend(ready, near, shared, grid, view, colours, floats, ints, batch, voxels):
     """Composites the samples of some rays, given as bits, those of `near` by harmonics; returns which rays end, their transmittance being spent.
 
     shared         whether rays beside each other are neighbours, which share voxels

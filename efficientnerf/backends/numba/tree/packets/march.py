@@ -53,7 +53,7 @@ _LINE = 16  # int32 of a cache line
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _axis(d):  # type: ignore[no-untyped-def]
+def _axis(d):
     """How rays cross the faces across an axis: slope, never, ahead and beside. A ray crosses the plane at x at (x - ex) * slope + never, and the face of cell
     a, `far` cells ahead, is at (a + beside + far * ahead) * width.
 
@@ -67,7 +67,7 @@ def _axis(d):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _near(a, e, c, grid, view):  # type: ignore[no-untyped-def]
+def _near(a, e, c, grid, view):
     """Which cells are too near for colours of the view, see `View`."""
     d, brick = view.direction, np.float32(grid.brick)
     x, y, z = a * brick + _HALF * brick, e * brick + _HALF * brick, c * brick + _HALF * brick
@@ -79,7 +79,7 @@ def _near(a, e, c, grid, view):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _prefetch_rows(lanes, grid, ints):  # type: ignore[no-untyped-def]
+def _prefetch_rows(lanes, grid, ints):
     """Asks for the tables of rows of the bricks in OWNER, before the first sample there needs them: docs/experiments/renderer.md"""
     size, before = (grid.brick + 2) * (grid.brick + 2) * (1 if grid.narrow else 2), np.int64(-1)
     while lanes != 0:
@@ -94,7 +94,7 @@ def _prefetch_rows(lanes, grid, ints):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped-def]
+def march(shared, grid, view, colours, floats, ints):
     """Adds the samples FIRST <= k < LAST of a packet's parts in a cascade to their states, see `layout`; both below 2^24. The half distance is one from the
     entry, voxels.
 

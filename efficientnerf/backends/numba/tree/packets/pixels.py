@@ -39,7 +39,7 @@ class Outputs(NamedTuple):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _unwarp_packet(tile, voxel, rays, scratch, with_normal):  # type: ignore[no-untyped-def]
+def _unwarp_packet(tile, voxel, rays, scratch, with_normal):
     """Depths and normals of the warped rays of a tile's subdivision as those of the world, world units."""
     lane, floats = 0, scratch.floats
     for row in range(tile.upper, tile.lower):
@@ -54,7 +54,7 @@ def _unwarp_packet(tile, voxel, rays, scratch, with_normal):  # type: ignore[no-
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _write_rows(tile, background, scale, floats, outputs):  # type: ignore[no-untyped-def]
+def _write_rows(tile, background, scale, floats, outputs):
     """Colours, opacities and depths of a packet of four rows of eight pixels, in lanes."""
     first, width, transmittance = tile.upper * outputs.width + tile.first, outputs.width, load(floats, TRANSMITTANCE, LANES)
     red, green, blue = load(floats, RED, LANES), load(floats, GREEN, LANES), load(floats, BLUE, LANES)
@@ -65,7 +65,7 @@ def _write_rows(tile, background, scale, floats, outputs):  # type: ignore[no-un
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _write_pixels(tile, background, scale, floats, outputs):  # type: ignore[no-untyped-def]
+def _write_pixels(tile, background, scale, floats, outputs):
     """All that is wanted of a packet of any shape, pixel by pixel."""
     lane = 0
     for row in range(tile.upper, tile.lower):
@@ -79,7 +79,7 @@ def _write_pixels(tile, background, scale, floats, outputs):  # type: ignore[no-
 
 
 @numba.njit(cache=True, error_model="numpy")
-def write_clear(top, low, left, right, background, outputs):  # type: ignore[no-untyped-def]
+def write_clear(top, low, left, right, background, outputs):
     """Writes pixels whose rays met nothing; returns the work that they were."""
     for row in range(top, low):
         for pixel in range(row * outputs.width + left, row * outputs.width + right):
@@ -92,7 +92,7 @@ def write_clear(top, low, left, right, background, outputs):  # type: ignore[no-
 
 
 @numba.njit(cache=True, error_model="numpy")
-def write_packet(tile, background, voxel, rays, scratch, outputs):  # type: ignore[no-untyped-def]
+def write_packet(tile, background, voxel, rays, scratch, outputs):
     """Writes the pixels of a tile's subdivision; returns the work that they were."""
     floats, count = scratch.floats, (tile.lower - tile.upper) * (tile.last - tile.first)
     if rays.warped:

@@ -17,7 +17,7 @@ MOST_SIDE = 32  # voxels of a row whose mask is an int32
 
 
 @numba.njit(cache=True, error_model="numpy")
-def order_voxels(first, end, first_voxel, brick, brick_index, voxel_index, begin, stored, voxel_of, coordinates):  # type: ignore[no-untyped-def]
+def order_voxels(first, end, first_voxel, brick, brick_index, voxel_index, begin, stored, voxel_of, coordinates):
     """Orders the voxels of a cascade's columns of cells first <= n < end, from first_voxel on; returns the voxel after them.
 
     begin        (B, b^2) int32: the first voxel of each row of a brick
@@ -47,14 +47,14 @@ def order_voxels(first, end, first_voxel, brick, brick_index, voxel_index, begin
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _owner(a, e, c, brick_index):  # type: ignore[no-untyped-def]
+def _owner(a, e, c, brick_index):
     """The brick of a cell, or -1."""
     inside = 0 <= a < brick_index.shape[0] and 0 <= e < brick_index.shape[1] and 0 <= c < brick_index.shape[2]
     return np.int64(brick_index[a, e, c]) if inside else np.int64(-1)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _row(before, here, after, row, last, begin, stored):  # type: ignore[no-untyped-def]
+def _row(before, here, after, row, last, begin, stored):
     """First voxel and mask of a row that crosses three bricks, any of which may be -1: the last voxel of one, all of the next, the first of the third."""
     edge = before >= 0 and stored[before, row] >> last & 1 != 0
     ahead = after >= 0 and stored[after, row] & 1 != 0
@@ -68,7 +68,7 @@ def _row(before, here, after, row, last, begin, stored):  # type: ignore[no-unty
 
 
 @numba.njit(cache=True, error_model="numpy")
-def fill_rows(first, end, cells, brick, brick_index, begin, stored, rows):  # type: ignore[no-untyped-def]
+def fill_rows(first, end, cells, brick, brick_index, begin, stored, rows):
     """Tables of bricks first <= B < end of a cascade, into `rows`, see `Packed`."""
     side = brick + 2
     narrow = rows.shape[1] == side * side

@@ -75,7 +75,7 @@ class TileScratch(NamedTuple):
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _cascade(n, scene):  # type: ignore[no-untyped-def]
+def _cascade(n, scene):
     """Cascade n of a scene as PackedPointers, and the View of it."""
     base, first = scene.base, scene.grids[4 * n + 3]
     grid = PackedPointers(
@@ -88,7 +88,7 @@ def _cascade(n, scene):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def clear_block(top, low, left, right, rays, scene, scratch):  # type: ignore[no-untyped-def]
+def clear_block(top, low, left, right, rays, scene, scratch):
     """Works out how far the rays of a block of tiles are clear in each cascade, or says 0 where that takes as long as for each of its tiles; returns whether
     they meet nothing.
     """
@@ -101,7 +101,7 @@ def clear_block(top, low, left, right, rays, scene, scratch):  # type: ignore[no
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _clear(n, tile, rays, scene, scratch):  # type: ignore[no-untyped-def]
+def _clear(n, tile, rays, scene, scratch):
     """Distance, voxels of cascade n, up to which the rays of a tile's subdivision are clear in it; worked out when first asked for."""
     if scratch.clear[n] < 0:
         grid, _ = _cascade(n, scene)
@@ -114,7 +114,7 @@ def _clear(n, tile, rays, scene, scratch):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _all_clear(tile, rays, scene, scratch):  # type: ignore[no-untyped-def]
+def _all_clear(tile, rays, scene, scratch):
     """Whether the rays of a tile's subdivision meet nothing."""
     n = 0
     while n < scene.cascades and _clear(n, tile, rays, scene, scratch) == np.inf:
@@ -123,13 +123,13 @@ def _all_clear(tile, rays, scene, scratch):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _packet_size(top, low):  # type: ignore[no-untyped-def]
+def _packet_size(top, low):
     """Rows and columns of the subdivisions of a tile."""
     return (1, LANES) if low - top == 1 else (4, LANES // 4)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _end_part(count, grid, with_normal, scratch):  # type: ignore[no-untyped-def]
+def _end_part(count, grid, with_normal, scratch):
     """Depths, voxels of cascade 0, and normals of the rays that lost half of their light in a part."""
     floats, places, found = scratch.floats, scratch.rays, np.int64(0)
     for lane in range(count):
@@ -145,7 +145,7 @@ def _end_part(count, grid, with_normal, scratch):  # type: ignore[no-untyped-def
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _render_packet(tile, rays, scene, colours, with_normal, scratch):  # type: ignore[no-untyped-def]
+def _render_packet(tile, rays, scene, colours, with_normal, scratch):
     """Renders the rays of a tile's subdivision, their parts in the cascades from front to back; what they met is in `scratch`."""
     count = begin_rays(tile, rays, scene, scratch)
     for part in range(1 - scene.cascades, scene.cascades):
@@ -160,7 +160,7 @@ def _render_packet(tile, rays, scene, colours, with_normal, scratch):  # type: i
 
 
 @numba.njit(cache=True, error_model="numpy")
-def render_tile(top, low, left, right, batch, background, scene, colours, voxel, scratch, outputs, done, work):  # type: ignore[no-untyped-def]
+def render_tile(top, low, left, right, batch, background, scene, colours, voxel, scratch, outputs, done, work):
     """Renders rows top to low and columns left to right, but for their first `done` subdivisions; returns how many are done, -1 for all, and the work left.
 
     work  that may be done; ends with the subdivision that it is spent on
