@@ -12,7 +12,7 @@ import numpy as np
 from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.splats.projection import LANES, basis16, colour16, conic16, image16
 from efficientnerf.backends.numba.vector.maths import broadcast, maximum, minimum, select, sigmoid, sqrt
-from efficientnerf.backends.numba.vector.memory import load, pointer, store
+from efficientnerf.backends.numba.vector.memory import load, load_three, pointer, store, store_three
 from efficientnerf.backends.splat_layout import DRAWS, ERROR, GRADIENTS, HARMONICS, MEAN, OPACITY, PARTS, ROTATION, SCALE, SQUARES, SUMS
 
 GROUPS_A_TASK = 64
@@ -41,20 +41,16 @@ def _geometry_gradients(p, at, lens, total, out):
     """Gradients by mean, logarithms of scales, quaternion and logit into rows MEAN to OPACITY of `out`; returns the longest standard deviation."""
     _x, _y, _depth, _seen, wx, wy, nx, ny, s, turned = image16(p, at, lens)
     ax, ay, _covariance, (a, b, c) = conic16(nx, ny, s)
-    v, vx, vy = load(total, 0, LANES), load(total, 16, LANES), load(total, 32, LANES)
-    vxx, vxy, vyy = load(total, 48, LANES), load(total, 64, LANES), load(total, 80, LANES)
+    v, vx, vy = load_three(total, 0, LANES)
+    vxx, vxy, vyy = load_three(total, 48, LANES)
     px, py = a * vx + b * vy, b * vx + c * vy
-    store(out, 16 * MEAN, px * wx[0] + py * wy[0])
-    store(out, 16 * (MEAN + 1), px * wx[1] + py * wy[1])
-    store(out, 16 * (MEAN + 2), px * wx[2] + py * wy[2])
+    store_three(out, 16 * MEAN, LANES, px * wx[0] + py * wy[0], px * wx[1] + py * wy[1], px * wx[2] + py * wy[2])
     # By the covariance in the image: half of Q V Q, Q the conic; by its root A twice that times A.
     qx, qy, rx, ry = a * vxx + b * vxy, a * vxy + b * vyy, b * vxx + c * vxy, b * vxy + c * vyy
     hxx, hxy, hyy = qx * a + qy * b, qx * b + qy * c, rx * b + ry * c
     dx0, dx1, dx2 = hxx * ax[0] + hxy * ay[0], hxx * ax[1] + hxy * ay[1], hxx * ax[2] + hxy * ay[2]
     dy0, dy1, dy2 = hxy * ax[0] + hyy * ay[0], hxy * ax[1] + hyy * ay[1], hxy * ax[2] + hyy * ay[2]
-    store(out, 16 * SCALE, dx0 * ax[0] + dy0 * ay[0])
-    store(out, 16 * (SCALE + 1), dx1 * ax[1] + dy1 * ay[1])
-    store(out, 16 * (SCALE + 2), dx2 * ax[2] + dy2 * ay[2])
+    store_three(out, 16 * SCALE, LANES, dx0 * ax[0] + dy0 * ay[0], dx1 * ax[1] + dy1 * ay[1], dx2 * ax[2] + dy2 * ay[2])
     dx0, dx1, dx2, dy0, dy1, dy2 = dx0 * s[0], dx1 * s[1], dx2 * s[2], dy0 * s[0], dy1 * s[1], dy2 * s[2]
     (w, x, y, z), length, _matrix = turned
     g00, g01, g02 = wx[0] * dx0 + wy[0] * dy0, wx[0] * dx1 + wy[0] * dy1, wx[0] * dx2 + wy[0] * dy2
@@ -66,9 +62,7 @@ def _geometry_gradients(p, at, lens, total, out):
     by_z = _TWO * (x * (g02 + g20) + y * (g12 + g21) + w * (g10 - g01) - _TWO * z * (g00 + g11))
     along = by_w * w + by_x * x + by_y * y + by_z * z
     store(out, 16 * ROTATION, (by_w - along * w) / length)
-    store(out, 16 * (ROTATION + 1), (by_x - along * x) / length)
-    store(out, 16 * (ROTATION + 2), (by_y - along * y) / length)
-    store(out, 16 * (ROTATION + 3), (by_z - along * z) / length)
+    store_three(out, 16 * (ROTATION + 1), LANES, (by_x - along * x) / length, (by_y - along * y) / length, (by_z - along * z) / length)
     store(out, 16 * OPACITY, v * (_ONE - sigmoid(load(p, at + 16 * OPACITY, LANES))))
     return maximum(s[0], maximum(s[1], s[2]))
 
@@ -78,13 +72,11 @@ def _colour_gradients(p, at, lens, degree, total, basis, out):
     """Gradients by the harmonics into rows from HARMONICS on."""
     basis16(p, at, lens, degree, basis)
     red, green, blue = colour16(p, at, degree, basis)
-    red, green = select(red > _NONE, load(total, 96, LANES), _NONE), select(green > _NONE, load(total, 112, LANES), _NONE)
-    blue = select(blue > _NONE, load(total, 128, LANES), _NONE)
+    r, g, b = load_three(total, 96, LANES)
+    red, green, blue = select(red > _NONE, r, _NONE), select(green > _NONE, g, _NONE), select(blue > _NONE, b, _NONE)
     for k in range((degree + 1) * (degree + 1)):
         value, row = load(basis, 16 * k, LANES), 16 * (HARMONICS + 3 * k)
-        store(out, row, value * red)
-        store(out, row + 16, value * green)
-        store(out, row + 32, value * blue)
+        store_three(out, row, LANES, value * red, value * green, value * blue)
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -12,39 +12,36 @@ P pairs, N Gaussians, H x W pixels.
 
 import numpy as np
 
-from efficientnerf.backends import layout
+from efficientnerf.backends import splat_layout as layout
+from efficientnerf.backends.layout import SSIM_C1, SSIM_C2
 from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.splats.pairs import BLOCK, Pairs
 from efficientnerf.backends.numba.splats.projection import LANES
 from efficientnerf.backends.numba.vector.maths import LOG2_E, bits_of, broadcast, exp2_neg, mask_of, maximum, minimum, select, sum_each, sum_lanes
-from efficientnerf.backends.numba.vector.memory import fetch_add, load, pointer, store
-from efficientnerf.backends.splat_layout import (
-    ALPHA,
-    CONIC_A,
-    CONIC_B,
-    CONIC_C,
-    LEAST_ALPHA,
-    LEAST_TRANSMITTANCE,
-    MOST_ALPHA,
-    RECORD,
-    RED,
-    SUMS,
-    TILE,
-    Picture,
-    X,
-    Y,
-)  # fmt: skip
+from efficientnerf.backends.numba.vector.memory import fetch_add, load, load_three, pointer, store, store_three
+from efficientnerf.backends.splat_layout import RECORD, SUMS, TILE, Picture
 
 _NONE, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
-_C1, _C2 = np.float32(layout.SSIM_C1), np.float32(layout.SSIM_C2)
+_C1, _C2 = np.float32(SSIM_C1), np.float32(SSIM_C2)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _exponent(p, at, x, y):
     """A Gaussian's distances from pixels, and what it hides before it is capped."""
-    dx, dy = x - p[at + X], y - p[at + Y]
-    q = dx * (dx * p[at + CONIC_A] + dy * (_TWO * p[at + CONIC_B])) + dy * dy * p[at + CONIC_C]
-    return dx, dy, exp2_neg(maximum(q * (_HALF * LOG2_E), _NONE)) * p[at + ALPHA]
+    dx, dy = x - p[at + layout.X], y - p[at + layout.Y]
+    q = dx * (dx * p[at + layout.CONIC_A] + dy * (_TWO * p[at + layout.CONIC_B])) + dy * dy * p[at + layout.CONIC_C]
+    return dx, dy, exp2_neg(maximum(q * (_HALF * LOG2_E), _NONE)) * p[at + layout.ALPHA]
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _covered(strength, light, open_):
+    """Of a Gaussian over pixels that are open: alpha, 1 - alpha, the light behind it, where it shows, and which pixels stay open."""
+    alpha = minimum(strength, layout.MOST_ALPHA)
+    rest = _ONE - alpha
+    left = light * rest
+    counts = open_ & (alpha >= layout.LEAST_ALPHA)
+    ends = counts & (left < layout.LEAST_TRANSMITTANCE)
+    return alpha, rest, left, counts & ~ends, open_ & ~ends
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -56,23 +53,16 @@ def _blend(p, bit, first, end, gaussian, mask, x, y, open_, met, place):
         if mask[pair] & bit:
             at = np.int64(gaussian[pair]) * RECORD
             _dx, _dy, strength = _exponent(p, at, x, y)
-            alpha = minimum(strength, MOST_ALPHA)
-            left = light * (_ONE - alpha)
-            counts = open_ & (alpha >= LEAST_ALPHA)
-            ends = counts & (left < LEAST_TRANSMITTANCE)
-            counts = counts & ~ends
-            open_ = open_ & ~ends
+            alpha, _rest, left, counts, open_ = _covered(strength, light, open_)
             if bits_of(counts) != 0:
                 weight = select(counts, light * alpha, _NONE)
-                red, green, blue = red + weight * p[at + RED], green + weight * p[at + RED + 1], blue + weight * p[at + RED + 2]
+                red, green, blue = red + weight * p[at + layout.RED], green + weight * p[at + layout.RED + 1], blue + weight * p[at + layout.RED + 2]
                 light = select(counts, left, light)
                 met[count] = pair
                 count += 1
             if bits_of(open_) == 0:
                 break
-    store(place, 0, red)
-    store(place, 16, green)
-    store(place, 32, blue)
+    store_three(place, 0, LANES, red, green, blue)
     store(place, 48, light)
     return count
 
@@ -176,27 +166,20 @@ def _residual(left, top, place, picture, slopes):
 def _pull(p, met, count, gaussian, slot, x, y, inside, place, slopes, sums):
     """Sums of the pairs that a block met, added to theirs: what the error changes by, with -q / 2 (v), with that times distances (v dx, v dy, v dx dx, v dx dy,
     v dy dy) and with the colour; and the error where it shows."""
-    by_red, by_green, by_blue, error = load(slopes, 0, LANES), load(slopes, 16, LANES), load(slopes, 32, LANES), load(slopes, 64, LANES)
-    behind = (
-        load(place, 0, LANES) * by_red + load(place, 16, LANES) * by_green + load(place, 32, LANES) * by_blue + load(place, 48, LANES) * load(slopes, 48, LANES)
-    )
-    light, open_ = broadcast(_ONE, LANES), inside
+    by_red, by_green, by_blue = load_three(slopes, 0, LANES)
+    red, green, blue = load_three(place, 0, LANES)
+    behind = red * by_red + green * by_green + blue * by_blue + load(place, 48, LANES) * load(slopes, 48, LANES)
+    error, light, open_ = load(slopes, 64, LANES), broadcast(_ONE, LANES), inside
     for n in range(count):
         pair = met[n]
         at = np.int64(gaussian[pair]) * RECORD
         dx, dy, strength = _exponent(p, at, x, y)
-        alpha = minimum(strength, MOST_ALPHA)
-        rest = _ONE - alpha
-        left = light * rest
-        counts = open_ & (alpha >= LEAST_ALPHA)
-        ends = counts & (left < LEAST_TRANSMITTANCE)
-        counts = counts & ~ends
-        open_ = open_ & ~ends
+        alpha, rest, left, counts, open_ = _covered(strength, light, open_)
         weight = select(counts, light * alpha, _NONE)
-        gain = by_red * p[at + RED] + by_green * p[at + RED + 1] + by_blue * p[at + RED + 2]
+        gain = by_red * p[at + layout.RED] + by_green * p[at + layout.RED + 1] + by_blue * p[at + layout.RED + 2]
         behind = behind - weight * gain
         v = (light * gain - behind / rest) * alpha
-        v = select(counts & (strength < MOST_ALPHA), v, _NONE)
+        v = select(counts & (strength < layout.MOST_ALPHA), v, _NONE)
         light = select(counts, left, light)
         vx, vy = v * dx, v * dy
         to = np.int64(slot[pair]) * SUMS

@@ -7,19 +7,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.tree import Cascade, NerfTree
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.leaps import leaps
-from efficientnerf.backends.numba.vector.memory import pointer
 
 
 class Cells(NamedTuple):
-    """Structure of a tree, all cascades alike; see `NerfTree`."""
+    """Structure of a tree, all cascades alike, see `NerfTree`; in kernels, which call it `tree`, its arrays are pointers."""
 
     brick: int
+    cube: int  # voxels of a brick
+    inverse: float  # of the brick's side
     nearest: bool
     step: float  # distance between samples, voxels
     step_length: float  # the same in cascade 0, units of the frame
+    cascades: int  # L
+    absent: int  # where the densities of bricks that are not stored begin in `dense_densities`
     voxel_index: np.ndarray
     brick_index: np.ndarray  # (C,) int32
     leap: np.ndarray  # (C,) uint8
@@ -27,43 +30,38 @@ class Cells(NamedTuple):
     first: np.ndarray  # (L,) int64 where a cascade's cells begin
     corner: np.ndarray  # (L, 3) float64, voxels of cascade 0
     scale: np.ndarray  # (L,) float64 side of a voxel, voxels of cascade 0
+    density: Any = None  # where there are any: those of `dense_densities`, or (N,), as callers say
+    one: Any = None  # 1 in their type
 
-
-class TreePointers(NamedTuple):
-    """Cells with arrays as pointers; `cascades` L, `cube` voxels of a brick, `inverse` of the brick's side, `absent` where densities of bricks that are not
-    stored begin, `one` in the densities' type, and `density` those of `dense_densities`, or (N,), as callers say."""
-
-    brick: int
-    cube: int
-    absent: int
-    inverse: float
-    nearest: bool
-    step: float
-    step_length: float
-    one: Any
-    cascades: int
-    voxel_index: Any
-    brick_index: Any
-    leap: Any
-    shape: Any
-    first: Any
-    corner: Any
-    scale: Any
-    density: Any
+    def having(self, density: np.ndarray) -> "Cells":
+        """The structure with densities."""
+        return self._replace(density=density, one=density.dtype.type(1))
 
 
 def cells_of(tree: NerfTree) -> Cells:
     """The structure of a tree, kept with it."""
     if "cells" not in tree.derived:
-        cells, outer, step = [tree.brick_index.size, *(cascade.brick_index.size for cascade in tree.outer)], tree.outer, float(tree.step_size)
+        outer, step = tree.outer, float(tree.step_size)
         index, leap = [tree.brick_index, *(cascade.brick_index for cascade in outer)], [tree.leap, *(leaps(cascade.brick_index >= 0) for cascade in outer)]
-        tree.derived["cells"] = Cells(
-            tree.brick, tree.lookup == "nearest", step, float(step * tree.voxel), np.ascontiguousarray(tree.voxel_index), _end_to_end(index, np.int32),
-            _end_to_end(leap, np.uint8), np.asarray([each.shape for each in index], np.int64), np.cumsum([0, *cells[:-1]]).astype(np.int64),
-            np.stack([np.zeros(3), *((cascade.bounds_min - tree.bounds_min) / tree.voxel for cascade in outer)]),
-            np.asarray([1.0, *(cascade.voxel / tree.voxel for cascade in outer)]),
-        )  # fmt: skip
+        corner = np.stack([np.zeros(3), *((cascade.bounds_min - tree.bounds_min) / tree.voxel for cascade in outer)])
+        scale = np.asarray([1.0, *(cascade.voxel / tree.voxel for cascade in outer)])
+        tree.derived["cells"] = _cells(tree, step, float(step * tree.voxel), index, leap, corner, scale)
     return tree.derived["cells"]
+
+
+def cascade_cells(tree: NerfTree, cascade: Cascade) -> Cells:
+    """The structure of one cascade, in its own voxels, without leaps."""
+    return _cells(tree, 1.0, float(cascade.voxel), [cascade.brick_index], [np.zeros(1, np.uint8)], np.zeros((1, 3)), np.ones(1))
+
+
+def _cells(
+    tree: NerfTree, step: float, step_length: float, index: list[np.ndarray], leap: list[np.ndarray], corner: np.ndarray, scale: np.ndarray
+) -> Cells:
+    sizes, brick, voxels = [each.size for each in index], tree.brick, np.ascontiguousarray(tree.voxel_index)
+    return Cells(
+        brick, brick**3, 1.0 / brick, tree.lookup == "nearest", step, step_length, len(index), voxels.size, voxels, _end_to_end(index, np.int32),
+        _end_to_end(leap, np.uint8), np.asarray([each.shape for each in index], np.int64), np.cumsum([0, *sizes[:-1]]).astype(np.int64), corner, scale,
+    )  # fmt: skip
 
 
 def _end_to_end(arrays: list[np.ndarray], kind: type) -> np.ndarray:
@@ -85,16 +83,6 @@ def dense_densities(cells: Cells, places: np.ndarray, density: np.ndarray) -> np
     dense = np.full(cells.voxel_index.size + cells.brick**3, -0.0, density.dtype)
     dense[places] = density
     return dense
-
-
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def tree_pointers(cells, density):
-    """See `TreePointers`."""
-    return TreePointers(
-        cells.brick, cells.brick * cells.brick * cells.brick, cells.voxel_index.size, 1.0 / cells.brick, cells.nearest, cells.step, cells.step_length,
-        density.dtype.type(1), len(cells.first), pointer(cells.voxel_index), pointer(cells.brick_index), pointer(cells.leap), pointer(cells.shape),
-        pointer(cells.first), pointer(cells.corner), pointer(cells.scale), pointer(density),
-    )  # fmt: skip
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")

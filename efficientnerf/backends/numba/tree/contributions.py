@@ -4,10 +4,10 @@ import numpy as np
 
 from efficientnerf.backends.layout import EARLY_STOP
 from efficientnerf.backends.numba.runtime import PRANGE, numba
-from efficientnerf.backends.numba.tree.cells import Cells, corner_voxels, corner_weight, stored_voxel, tree_pointers
+from efficientnerf.backends.numba.tree.cells import Cells, corner_voxels, corner_weight, stored_voxel
 from efficientnerf.backends.numba.tree.march import march_with
 from efficientnerf.backends.numba.tree_training.scalars import cast_like
-from efficientnerf.backends.numba.vector.memory import pointer
+from efficientnerf.backends.numba.vector.memory import pointer, pointers
 
 
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
@@ -46,11 +46,11 @@ _march = march_with(_raise)
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _max_contributions(cells, origins, directions, density, stop, transmittance, visibility):
+def _max_contributions(cells, origins, directions, stop, transmittance, visibility):
     """Share p of the rays raises visibility[p]: no races, and a maximum does not depend on the order."""
     shares, rays = len(visibility), len(origins)
     for share in numba.prange(shares):
-        index, into, tree = np.empty(8, np.int32), visibility[share], tree_pointers(cells, density)
+        index, into, tree = np.empty(8, np.int32), visibility[share], pointers(cells)
         for ray in range(rays * share // shares, rays * (share + 1) // shares):
             scene = pointer(into), visibility.dtype.type(0), pointer(index), transmittance[ray]
             _march(origins[ray], directions[ray], 0.0, tree, stop, scene, (1.0,))
@@ -72,4 +72,4 @@ def max_contributions(
     transmittance        (R,) of what lies in front of the box
     visibility           (P, N) float32: for each share of the rays; P from 1 to the number of threads
     """
-    _max_contributions(cells, origins, directions, density, float(stop), transmittance, visibility)
+    _max_contributions(cells.having(density), origins, directions, float(stop), transmittance, visibility)

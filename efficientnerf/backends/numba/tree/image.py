@@ -6,9 +6,8 @@ from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.tree.packets.layout import ENDS, FLOATS, INTS, LANES, TILE_RAYS, WARPED
 from efficientnerf.backends.numba.tree.packets.pixels import Outputs, write_clear
 from efficientnerf.backends.numba.tree.packets.tiles import Scene, TileScratch, clear_block, render_tile
-from efficientnerf.backends.numba.tree.ray_batch import ray_pointers
 from efficientnerf.backends.numba.tree.view_colours import packed_pointers
-from efficientnerf.backends.numba.vector.memory import fetch_add, pointer
+from efficientnerf.backends.numba.vector.memory import fetch_add, pointer, pointers
 
 TILE = 8  # rays along each side of a tile
 BLOCK = 4  # tiles along each side of a block of them, which a thread takes
@@ -95,11 +94,8 @@ def render_batch(
             pointer(mine[clear + 2 * cascades :]), pointer(warped[worker]), pointer(looking[worker]),
         )  # fmt: skip
         outputs = Outputs(width, pointer(colour), pointer(opacity), pointer(depth), pointer(normal), len(normal) > 0)
-        rays = ray_pointers(batch)
-        scene = Scene(
-            cascades, packed_pointers(packed, brick, 0), pointer(packed.grids), pointer(packed.places), pointer(views.direction), views.direction_rate,
-            pointer(views.min_distance), pointer(views.density_scale), views.step, views.degree,
-        )  # fmt: skip
+        rays = pointers(batch)
+        scene = Scene(cascades, packed_pointers(packed, brick, 0), pointer(packed.grids), pointer(packed.places), pointers(views))
         # The index is of another type where numba infers types than where it runs: as it is, the function would be compiled for both.
         _render_blocks(np.int64(worker), threads, budget, progress, height, tile, rays, background, scene, pointer(view_colours[1:]), voxel, scratch, outputs)
     rows, columns = BLOCK * tile[0], BLOCK * tile[1]

@@ -126,7 +126,7 @@ def march_with(visit: Callable[..., Any]) -> Callable[..., Any]:
 
     visit   compiled, (point, cell, t, cascade, tree, scene, state) -> state: coordinates, coarse cell and distance in voxels of the cascade
     clear   distance before which the ray meets nothing, voxels of cascade 0
-    tree    TreePointers
+    tree    Cells with densities, of pointers
     stop    the ray ends where state[0] is below it
     scene   what does not change along the ray
     state   a tuple of numbers, the transmittance first

@@ -8,10 +8,10 @@ import numpy as np
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.layout import EARLY_STOP
 from efficientnerf.backends.numba.runtime import PRANGE, numba
-from efficientnerf.backends.numba.tree.cells import cells_of, stored_voxel, tree_pointers
+from efficientnerf.backends.numba.tree.cells import cells_of, stored_voxel
 from efficientnerf.backends.numba.tree.march import march_with
 from efficientnerf.backends.numba.tree.queries import normal_at
-from efficientnerf.backends.numba.vector.memory import advanced, pointer
+from efficientnerf.backends.numba.vector.memory import advanced, pointer, pointers
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.rendering.harmonics import basis_numpy
 
@@ -59,10 +59,10 @@ _march = march_with(_composite)
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _render(cells, density, sh, origins, directions, bases, colour, opacity, half_distance):
+def _render(cells, sh, origins, directions, bases, colour, opacity, half_distance):
     rays, terms = len(origins), bases.shape[1]
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):
-        rgb, tree = np.empty(3), tree_pointers(cells, density)
+        rgb, tree = np.empty(3), pointers(cells)
         for ray in range(block * BLOCK, min(rays, block * BLOCK + BLOCK)):
             scene = pointer(sh), advanced(pointer(bases), terms * ray), pointer(rgb), advanced(pointer(colour), 3 * ray), terms
             left, half, _ = _march(origins[ray], directions[ray], 0.0, tree, EARLY_STOP, scene, (1.0, np.inf, np.int32(-1)))
@@ -78,10 +78,10 @@ def render_rays(
     starts = np.ascontiguousarray((origins - tree.bounds_min) / tree.voxel)
     bases = np.ascontiguousarray(basis_numpy(np.asarray(directions if sh_directions is None else sh_directions, np.float32), tree.degree))
     colour, opacity, half_distance = np.zeros((len(starts), 3)), np.zeros(len(starts)), np.full(len(starts), np.inf)
-    cells = cells_of(tree)
+    cells = cells_of(tree).having(tree.density_values)
     for part in pieces(len(starts)):
         given = (starts[part], directions[part], bases[part], colour[part], opacity[part], half_distance[part])
-        _render(cells, tree.density_values, tree.sh, *given)
+        _render(cells, tree.sh, *given)
     depth = half_distance * tree.voxel
     normal, hit = np.zeros((len(starts), 3), np.float32), np.isfinite(half_distance)
     if hit.any():

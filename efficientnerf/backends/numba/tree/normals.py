@@ -3,9 +3,9 @@
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.tree.packets.layout import LANES, NORMAL_X, NORMAL_Y, NORMAL_Z
+from efficientnerf.backends.numba.tree.packets.layout import LANES, NORMAL, PLACE
 from efficientnerf.backends.numba.vector.maths import floor, mask_of, maximum, minimum, popcount, select, sqrt, to_int32
-from efficientnerf.backends.numba.vector.memory import gather, load, store
+from efficientnerf.backends.numba.vector.memory import gather, load_three, store_three
 
 _HALF, _ONE, _NONE = np.float32(0.5), np.float32(1), np.float32(0)
 
@@ -47,10 +47,10 @@ def _densities(u, v, w, lanes, grid):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def add_normals(lanes, x, y, z, grid, floats):
-    """Unit normals at points whose coordinates, voxels, are in `floats` at x, y and z, of the rays whose bits are set: down the density's gradient by central
-    differences of one voxel; zero where the density is flat."""
-    u, v, w = load(floats, x, LANES), load(floats, y, LANES), load(floats, z, LANES)
+def add_normals(lanes, grid, floats):
+    """Unit normals at the places of the rays whose bits are set, voxel coordinates: down the density's gradient by central differences of one voxel; zero
+    where the density is flat."""
+    u, v, w = load_three(floats, PLACE, LANES)
     gx = _densities(u - _ONE, v, w, lanes, grid) - _densities(u + _ONE, v, w, lanes, grid)
     gy = _densities(u, v - _ONE, w, lanes, grid) - _densities(u, v + _ONE, w, lanes, grid)
     gz = _densities(u, v, w - _ONE, lanes, grid) - _densities(u, v, w + _ONE, lanes, grid)
@@ -58,6 +58,5 @@ def add_normals(lanes, x, y, z, grid, floats):
     some = length > _NONE
     length = select(some, length, _ONE)
     some = some & mask_of(lanes, LANES)
-    store(floats, NORMAL_X, select(some, gx / length, load(floats, NORMAL_X, LANES)))
-    store(floats, NORMAL_Y, select(some, gy / length, load(floats, NORMAL_Y, LANES)))
-    store(floats, NORMAL_Z, select(some, gz / length, load(floats, NORMAL_Z, LANES)))
+    x, y, z = load_three(floats, NORMAL, LANES)
+    store_three(floats, NORMAL, LANES, select(some, gx / length, x), select(some, gy / length, y), select(some, gz / length, z))

@@ -1,6 +1,6 @@
 """Density, normal and colour of a tree at points (numba, all cores), from the tree's own arrays."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +8,8 @@ import numpy as np
 from efficientnerf.asset.cascades import cascades_of, point_cascades
 from efficientnerf.asset.tree import Cascade, NerfTree
 from efficientnerf.backends.numba.runtime import PRANGE, numba
-from efficientnerf.backends.numba.tree.cells import Cells, corner_voxels, tree_pointers
+from efficientnerf.backends.numba.tree.cells import Cells, cascade_cells, corner_voxels
+from efficientnerf.backends.numba.vector.memory import pointers
 from efficientnerf.rendering.harmonics import basis_numpy
 
 BLOCK = 1024  # points per task
@@ -90,19 +91,19 @@ def _colour(index, weight, sh, basis, out):
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _densities(points, grid, density, out):
+def _densities(points, grid, out):
     for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
         index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
-        tree = tree_pointers(grid, density)
+        tree = pointers(grid)
         for n in range(block * BLOCK, min(points.shape[0], block * BLOCK + BLOCK)):
             out[n] = _density(points[n, 0], points[n, 1], points[n, 2], tree, index, weight)
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _distances_back(points, directions, optical, step, most, grid, density, out):
+def _distances_back(points, directions, optical, step, most, grid, out):
     for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
         index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
-        tree = tree_pointers(grid, density)
+        tree = pointers(grid)
         for n in range(block * BLOCK, min(points.shape[0], block * BLOCK + BLOCK)):
             x, y, z = points[n, 0], points[n, 1], points[n, 2]
             after = np.float64(_density(x, y, z, tree, index, weight))
@@ -118,19 +119,19 @@ def _distances_back(points, directions, optical, step, most, grid, density, out)
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _normals(points, grid, density, out):
+def _normals(points, grid, out):
     for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
         index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
-        tree = tree_pointers(grid, density)
+        tree = pointers(grid)
         for n in range(block * BLOCK, min(points.shape[0], block * BLOCK + BLOCK)):
             _normal(points[n, 0], points[n, 1], points[n, 2], tree, index, weight, out[n])
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _colours(points, bases, grid, density, sh, out):
+def _colours(points, bases, grid, sh, out):
     for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
         index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
-        tree = tree_pointers(grid, density)
+        tree = pointers(grid)
         for n in range(block * BLOCK, min(points.shape[0], block * BLOCK + BLOCK)):
             _corners(points[n, 0], points[n, 1], points[n, 2], tree, index, weight)
             _colour(index, weight, sh, bases[n], out[n])
@@ -149,21 +150,23 @@ def _grids(tree: NerfTree, points: np.ndarray) -> Iterator[tuple[np.ndarray | sl
     owner = point_cascades(tree, points).clip(0) if tree.outer else None
     for n, cascade in enumerate(cascades):
         chosen = slice(None) if owner is None else np.flatnonzero(owner == n)
-        grid = Cells(
-            tree.brick, tree.lookup == "nearest", 1.0, float(cascade.voxel), tree.voxel_index, np.ascontiguousarray(cascade.brick_index).reshape(-1),
-            np.zeros(1, np.uint8), np.asarray([cascade.brick_index.shape], np.int64), np.zeros(1, np.int64), np.zeros((1, 3)), np.ones(1),
-        )  # fmt: skip
+        grid = cascade_cells(tree, cascade).having(tree.density_values)
         yield chosen, _voxel_coordinates(tree, cascade, points[chosen]), grid
+
+
+def _by_cascade(tree: NerfTree, points: np.ndarray, out: np.ndarray, write: Callable[..., None]) -> np.ndarray:
+    """`out` (N, ...), of which `write` (voxel coordinates, cascade, which points, part) writes the part of each cascade."""
+    for chosen, at, grid in _grids(tree, points):
+        part = np.empty((len(at), *out.shape[1:]), np.float32)
+        write(at, grid, chosen, part)
+        out[chosen] = part
+    return out
 
 
 def density_at(tree: NerfTree, points: np.ndarray) -> np.ndarray:
     """(N,) float32 at points (N, 3) of the tree's frame."""
     out = np.empty(len(points), np.float32)
-    for chosen, at, grid in _grids(tree, points):
-        part = np.empty(len(at), np.float32)
-        _densities(at, grid, tree.density_values, part)
-        out[chosen] = part
-    return out
+    return _by_cascade(tree, points, out, lambda at, grid, _, part: _densities(at, grid, part))
 
 
 def distance_back(tree: NerfTree, points: np.ndarray, directions: np.ndarray, optical_depth: float, longest: float) -> np.ndarray:
@@ -173,18 +176,14 @@ def distance_back(tree: NerfTree, points: np.ndarray, directions: np.ndarray, op
     _, at, grid = next(_grids(replace(tree, outer=()) if tree.outer else tree, points))
     out = np.empty(len(at), np.float32)
     towards, most = np.ascontiguousarray(directions, np.float32), round(longest / voxel / STEP_BACK)
-    _distances_back(at, towards, optical_depth / voxel, STEP_BACK, most, grid, tree.density_values, out)
+    _distances_back(at, towards, optical_depth / voxel, STEP_BACK, most, grid, out)
     return out * np.float32(voxel)
 
 
 def normal_at(tree: NerfTree, points: np.ndarray) -> np.ndarray:
     """(N, 3) float32 unit normals at points (N, 3) of the tree's frame, from the cascade that a point belongs to; zero where the density is flat."""
     out = np.empty((len(points), 3), np.float32)
-    for chosen, at, grid in _grids(tree, points):
-        part = np.empty((len(at), 3), np.float32)
-        _normals(at, grid, tree.density_values, part)
-        out[chosen] = part
-    return out
+    return _by_cascade(tree, points, out, lambda at, grid, _, part: _normals(at, grid, part))
 
 
 def colour_at(tree: NerfTree, points: np.ndarray, directions: np.ndarray | None) -> np.ndarray:
@@ -195,8 +194,8 @@ def colour_at(tree: NerfTree, points: np.ndarray, directions: np.ndarray | None)
     else:
         bases = basis_numpy(np.ascontiguousarray(directions, np.float32), tree.degree)
     out = np.empty((len(points), 3), np.float32)
-    for chosen, at, grid in _grids(tree, points):
-        part = np.empty((len(at), 3), np.float32)
-        _colours(at, np.ascontiguousarray(bases[chosen]), grid, tree.density_values, tree.sh, part)
-        out[chosen] = part
-    return out
+
+    def write(at: np.ndarray, grid: Cells, chosen: np.ndarray | slice, part: np.ndarray) -> None:
+        _colours(at, np.ascontiguousarray(bases[chosen]), grid, tree.sh, part)
+
+    return _by_cascade(tree, points, out, write)

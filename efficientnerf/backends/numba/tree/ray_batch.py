@@ -12,16 +12,9 @@ import numpy as np
 
 from efficientnerf.backends.numba.rays import warp_ray, world_distance, world_normal
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.tree.packets.layout import (
-    WARPED_BEGIN,
-    WARPED_BEND,
-    WARPED_COSINE,
-    WARPED_DIRECTION,
-    WARPED_ORIGIN,
-    WARPED_SPEED,
-)
+from efficientnerf.backends.numba.tree.packets import layout
 from efficientnerf.backends.numba.vector.maths import sqrt
-from efficientnerf.backends.numba.vector.memory import advanced, pointer
+from efficientnerf.backends.numba.vector.memory import advanced
 
 MIN_ADVANCE = 2.0  # voxels: a cone that advances by less has arrived; docs/experiments/renderer.md
 MAX_ADVANCES = 64
@@ -29,54 +22,36 @@ PINHOLE, DIRECTION_TABLE, GIVEN_RAYS = 0, 1, 2
 
 
 class RayBatch(NamedTuple):
-    """Rays in H rows and W columns; see the module."""
+    """Rays in H rows and W columns, see the module; arrays, or in kernels pointers to them, of which those that a kind of rays does not need are empty."""
 
-    lens: np.ndarray  # (4,) fx, fy, cx, cy, pixels: read where neither `camera_directions` nor `origins` are given
-    pitch: float  # distance of neighbouring rays, pixels; the first ray lies half of it from the left and upper border of the image
-    first_row: int  # row of the first ray
-    rotation: np.ndarray  # (3, 3) world from camera
-    centre: np.ndarray  # (3,) of the camera, voxel coordinates of cascade 0; in the world for a tree in normalised device coordinates
-    camera_directions: np.ndarray  # (H, W, 3) float32 unit directions in the camera's frame, or (0, 0, 3)
-    origins: np.ndarray  # (H, W, 3) voxel coordinates of cascade 0, or (0, 0, 3)
-    directions: np.ndarray  # (H, W, 3) unit directions, with `origins`
-    sh_directions: np.ndarray  # (H, W, 3) float32 directions that harmonics are evaluated along, or (0, 0, 3): those of the rays
-    ndc: np.ndarray  # (19,) for a camera's rays into a tree in normalised device coordinates: `rays.ndc_numbers`, the corner and the voxel of its grid; or (0,)
-
-
-class RayPointers(NamedTuple):
-    """A RayBatch with its arrays as pointers; `kind` is PINHOLE, DIRECTION_TABLE or GIVEN_RAYS. `warped` rays go through `tile_rays` before they are traced."""
-
-    kind: int
-    width: int
-    fx: float
+    kind: int  # PINHOLE, DIRECTION_TABLE or GIVEN_RAYS
+    width: int  # W of the arrays
+    fx: float  # of a pinhole, pixels
     fy: float
     cx: float
     cy: float
-    pitch: float
-    first_row: int
-    rotation: Any
-    x: float
+    pitch: float  # distance of neighbouring rays, pixels; the first ray lies half of it from the left and upper border of the image
+    first_row: int  # row of the first ray
+    rotation: Any  # (3, 3) world from camera
+    x: float  # the camera's centre, voxel coordinates of cascade 0; in the world for a tree in normalised device coordinates
     y: float
     z: float
-    camera_directions: Any
-    origins: Any
-    directions: Any
+    camera_directions: Any  # (H, W, 3) float32 unit directions in the camera's frame, of a table
+    origins: Any  # (H, W, 3) voxel coordinates of cascade 0, and
+    directions: Any  # (H, W, 3) unit directions, of given rays
     has_sh_directions: bool
-    sh_directions: Any
-    warped: bool
-    ndc: Any
+    sh_directions: Any  # (H, W, 3) float32 directions that harmonics are evaluated along, if not along the rays
+    warped: bool  # whether they go through `tile_rays` before they are traced, into a tree in normalised device coordinates
+    ndc: Any  # (19,) then: `rays.ndc_numbers`, the corner and the voxel of its grid
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def ray_pointers(batch):
-    """See `RayPointers`."""
-    kind = GIVEN_RAYS if len(batch.origins) > 0 else DIRECTION_TABLE if len(batch.camera_directions) > 0 else PINHOLE
-    width = batch.origins.shape[1] if kind == GIVEN_RAYS else batch.camera_directions.shape[1]
-    lens, centre = batch.lens, batch.centre
-    return RayPointers(
-        kind, width, lens[0], lens[1], lens[2], lens[3], batch.pitch, batch.first_row, pointer(batch.rotation), centre[0], centre[1], centre[2],
-        pointer(batch.camera_directions), pointer(batch.origins), pointer(batch.directions), len(batch.sh_directions) > 0, pointer(batch.sh_directions),
-        len(batch.ndc) > 0, pointer(batch.ndc),
+def given_rays(origins: np.ndarray, directions: np.ndarray, sh_directions: np.ndarray | None = None) -> RayBatch:
+    """Rays (H, W, 3), see `RayBatch`."""
+    none = np.zeros((0, 0, 3), np.float32)
+    has_other = sh_directions is not None and len(sh_directions) > 0
+    return RayBatch(
+        GIVEN_RAYS, origins.shape[1], 0.0, 0.0, 0.0, 0.0, 1.0, 0, np.eye(3), 0.0, 0.0, 0.0, none, origins, directions,
+        has_other, none if sh_directions is None else sh_directions, False, np.zeros(0),
     )  # fmt: skip
 
 
@@ -124,33 +99,34 @@ def tile_rays(top, low, left, right, rays, warped, looking):
             n = (row - top) * width + column - left
             looking[3 * n], looking[3 * n + 1], looking[3 * n + 2] = dx, dy, dz
             x, y, z, dx, dy, dz, begin, ds_dt, dlogz_dt = warp_ray(x, y, z, dx, dy, dz, ndc)
-            origin, along = WARPED_ORIGIN + 3 * n, WARPED_DIRECTION + 3 * n
+            origin, along = layout.WARPED_ORIGIN + 3 * n, layout.WARPED_DIRECTION + 3 * n
             warped[origin], warped[origin + 1], warped[origin + 2] = (x - ndc[15]) * per_voxel, (y - ndc[16]) * per_voxel, (z - ndc[17]) * per_voxel
             warped[along], warped[along + 1], warped[along + 2] = dx, dy, dz
-            warped[WARPED_BEGIN + n], warped[WARPED_SPEED + n], warped[WARPED_BEND + n], warped[WARPED_COSINE + n] = begin, ds_dt, dlogz_dt, cosine
+            warped[layout.WARPED_BEGIN + n], warped[layout.WARPED_SPEED + n], warped[layout.WARPED_BEND + n] = begin, ds_dt, dlogz_dt
+            warped[layout.WARPED_COSINE + n] = cosine
     first = -3 * (top * width + left)  # as if the tile were a part of the image
-    return RayPointers(
+    return RayBatch(
         np.int64(GIVEN_RAYS),  # type: ignore[arg-type]
         width, rays.fx, rays.fy, rays.cx, rays.cy, rays.pitch, rays.first_row, rays.rotation, rays.x, rays.y, rays.z,
-        rays.camera_directions, advanced(warped, WARPED_ORIGIN + first), advanced(warped, WARPED_DIRECTION + first), True, advanced(looking, first),
-        True, rays.ndc,
+        rays.camera_directions, advanced(warped, layout.WARPED_ORIGIN + first), advanced(warped, layout.WARPED_DIRECTION + first),
+        True, advanced(looking, first), True, rays.ndc,
     )  # fmt: skip
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def world_depth(n, along, warped):
     """Depth along the view axis, float32, of a point `along` the n-th ray of a tile that `tile_rays` warped, units of the frame."""
-    distance = world_distance(np.float64(along), warped[WARPED_BEGIN + n], warped[WARPED_SPEED + n], warped[WARPED_BEND + n])
-    return np.float32(np.float64(distance) * warped[WARPED_COSINE + n])
+    distance = world_distance(np.float64(along), warped[layout.WARPED_BEGIN + n], warped[layout.WARPED_SPEED + n], warped[layout.WARPED_BEND + n])
+    return np.float32(np.float64(distance) * warped[layout.WARPED_COSINE + n])
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def normal_in_world(n, along, nx, ny, nz, ndc, warped):
     """The normal of the frame (nx, ny, nz) at that point as one of the world."""
     at, s = 3 * n, np.float64(along)
-    x = warped[WARPED_ORIGIN + at] * ndc[18] + ndc[15] + s * warped[WARPED_DIRECTION + at]
-    y = warped[WARPED_ORIGIN + at + 1] * ndc[18] + ndc[16] + s * warped[WARPED_DIRECTION + at + 1]
-    z = warped[WARPED_ORIGIN + at + 2] * ndc[18] + ndc[17] + s * warped[WARPED_DIRECTION + at + 2]
+    x = warped[layout.WARPED_ORIGIN + at] * ndc[18] + ndc[15] + s * warped[layout.WARPED_DIRECTION + at]
+    y = warped[layout.WARPED_ORIGIN + at + 1] * ndc[18] + ndc[16] + s * warped[layout.WARPED_DIRECTION + at + 1]
+    z = warped[layout.WARPED_ORIGIN + at + 2] * ndc[18] + ndc[17] + s * warped[layout.WARPED_DIRECTION + at + 2]
     return world_normal(x, y, z, np.float64(nx), np.float64(ny), np.float64(nz), ndc)
 
 

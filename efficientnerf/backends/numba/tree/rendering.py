@@ -17,7 +17,7 @@ from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.image import TILE, WORK, beginning, downsample, render_batch
 from efficientnerf.backends.numba.tree.march import LOG2E
 from efficientnerf.backends.numba.tree.packed import VOXELS_PER_CALL, packed_of
-from efficientnerf.backends.numba.tree.ray_batch import RayBatch
+from efficientnerf.backends.numba.tree.ray_batch import DIRECTION_TABLE, PINHOLE, RayBatch, given_rays
 from efficientnerf.backends.numba.tree.surroundings import add_environment
 from efficientnerf.backends.numba.tree.view_colours import Views, compute_view_colours
 from efficientnerf.geometry.cameras import Camera, rays
@@ -123,13 +123,9 @@ def _render(tree: NerfTree, batch: RayBatch, colours: ViewColours, background: n
 
 
 def render_rays(
-    tree: NerfTree,
-    origins: np.ndarray,
-    directions: np.ndarray,
-    sh_directions: np.ndarray | None = None,
-    eye: np.ndarray | None = None,
+    tree: NerfTree, origins: np.ndarray, directions: np.ndarray, sh_directions: np.ndarray | None = None, eye: np.ndarray | None = None,
     columns: int | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Colour (R, 3) premultiplied, opacity (R,), distance (R,), normal (R, 3) of rays; see `Rendering`.
 
     origins, directions  (R, 3) in the tree's frame, unit directions
@@ -140,12 +136,12 @@ def render_rays(
     if columns is not None and (columns < 1 or len(origins) % columns):
         raise ValueError(f"{len(origins)} rays in rows of {columns}: they have to fill the rows")
     rows, columns = (1, len(origins)) if columns is None else (len(origins) // columns, columns)
-    shape, none = (rows, columns, 3), np.zeros((0, 0, 3), np.float32)
+    shape = (rows, columns, 3)
     starts = ((np.asarray(origins, np.float64) - tree.bounds_min) / tree.voxel).reshape(shape)
     directions = np.ascontiguousarray(directions, np.float64).reshape(shape)
-    along = none if sh_directions is None else np.ascontiguousarray(sh_directions, np.float32).reshape(shape)
+    along = None if sh_directions is None else np.ascontiguousarray(sh_directions, np.float32).reshape(shape)
     view_direction = np.eye(3, 4) if eye is None else _view_direction(tree, eye)
-    batch = RayBatch(np.zeros(4), 1.0, 0, np.eye(3), np.zeros(3), none, np.ascontiguousarray(starts), directions, along, np.zeros(0))
+    batch = given_rays(np.ascontiguousarray(starts), directions, along)
     out = _allocate(rows, columns, normals=True)
     if len(origins):
         shared = eye is not None and _any_far(tree, view_direction)
@@ -195,23 +191,16 @@ def _camera_centre(tree: NerfTree, camera: Camera) -> np.ndarray:
 
 def _camera_batch(tree: NerfTree, camera: Camera, supersample: int, top: int, low: int) -> RayBatch:
     """The rays of rows top to low of a camera's image."""
-    k, none = camera.intrinsics, np.zeros((0, 0, 3), np.float32)
-    centre = _camera_centre(tree, camera)
-    table = none
+    kind, table, none = PINHOLE, np.zeros((0, 0, 3), np.float32), np.zeros((0, 0, 3))
     if camera.model not in PINHOLES:
-        table = _camera_directions(camera.model, camera.params, camera.width, camera.height, supersample, top, low)
+        kind, table = DIRECTION_TABLE, _camera_directions(camera.model, camera.params, camera.width, camera.height, supersample, top, low)
+    fx, fy, cx, cy = (float(camera.intrinsics[name]) for name in ("fx", "fy", "cx", "cy"))
+    rotation, (x, y, z) = np.ascontiguousarray(camera.world_from_camera[:3, :3], np.float64), _camera_centre(tree, camera).tolist()
+    ndc = np.zeros(0) if tree.ndc is None else np.concatenate([ndc_numbers(tree.ndc), tree.bounds_min, [tree.voxel]])
     return RayBatch(
-        lens=np.array([k["fx"], k["fy"], k["cx"], k["cy"]]),
-        pitch=1 / supersample,
-        first_row=top * supersample,
-        rotation=np.ascontiguousarray(camera.world_from_camera[:3, :3], np.float64),
-        centre=centre,
-        camera_directions=table,
-        origins=none.astype(np.float64),
-        directions=none.astype(np.float64),
-        sh_directions=none,
-        ndc=np.zeros(0) if tree.ndc is None else np.concatenate([ndc_numbers(tree.ndc), tree.bounds_min, [tree.voxel]]),
-    )
+        kind, table.shape[1], fx, fy, cx, cy, 1 / supersample, top * supersample, rotation, x, y, z, table, none, none,
+        False, none.astype(np.float32), tree.ndc is not None, ndc,
+    )  # fmt: skip
 
 
 def render_image(

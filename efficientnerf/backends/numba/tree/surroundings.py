@@ -9,8 +9,8 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.tree.march import PACKED_EARLY_STOP
-from efficientnerf.backends.numba.tree.ray_batch import RayBatch, ray_at, ray_pointers
-from efficientnerf.backends.numba.vector.memory import pointer
+from efficientnerf.backends.numba.tree.ray_batch import RayBatch, given_rays, ray_at
+from efficientnerf.backends.numba.vector.memory import pointer, pointers
 
 RAYS_PER_CALL = 2**20  # so that signals are answered between calls
 
@@ -36,7 +36,7 @@ def _lookup(x, y, z, environment, height, width, out):
 def _add(first, end, batch, environment, opacity, colour):
     height, width = environment.shape[:2]
     for row in numba.prange(first, end):
-        rays, texels, behind = ray_pointers(batch), pointer(environment), np.empty(3)
+        rays, texels, behind = pointers(batch), pointer(environment), np.empty(3)
         for column in range(opacity.shape[1]):
             transmittance = np.float32(1) - opacity[row, column]
             if transmittance < np.float32(PACKED_EARLY_STOP):  # the rest of such a ray was not looked at
@@ -57,9 +57,9 @@ def add_environment(environment: np.ndarray, batch: RayBatch, opacity: np.ndarra
 
 def over_environment(environment: np.ndarray, directions: np.ndarray, opacity: np.ndarray, colour: np.ndarray) -> np.ndarray:
     """Colours (R, 3) of rays, premultiplied by opacities (R,), over what of a map is seen along their unit directions (R, 3), world frame."""
-    none, shape = np.zeros((0, 0, 3), np.float32), (len(directions), 1, 3)
+    shape = (len(directions), 1, 3)
     along = np.ascontiguousarray(directions, np.float64).reshape(shape)
-    batch = RayBatch(np.zeros(4), 1.0, 0, np.eye(3), np.zeros(3), none, along, along, none, np.zeros(0))
+    batch = given_rays(along, along)
     out = np.array(colour, np.float32).reshape(shape)
     add_environment(environment, batch, np.ascontiguousarray(opacity, np.float32).reshape(shape[:2]), out)
     return out.reshape(-1, 3)

@@ -19,7 +19,7 @@ import numpy as np
 
 from efficientnerf.backends.layout import EARLY_STOP, SSIM_C1, SSIM_C2, SSIM_WINDOW, RayTargets
 from efficientnerf.backends.numba.runtime import PRANGE, numba
-from efficientnerf.backends.numba.tree.cells import Cells, tree_pointers
+from efficientnerf.backends.numba.tree.cells import Cells
 from efficientnerf.backends.numba.tree_training.packets import (
     BLOCKS,
     FIRST_BLOCKS,
@@ -29,13 +29,12 @@ from efficientnerf.backends.numba.tree_training.packets import (
     clear,
     clear_distance,
     packet_arrays,
-    packet_pointers,
     walk_ray,
 )
 from efficientnerf.backends.numba.tree_training.scalars import cast_like, sigmoid
 from efficientnerf.backends.numba.vector.corners import mix_corners, spread_corners
 from efficientnerf.backends.numba.vector.maths import fma
-from efficientnerf.backends.numba.vector.memory import fetch_add, pointer, prefetch
+from efficientnerf.backends.numba.vector.memory import fetch_add, pointer, pointers, prefetch
 
 CHUNK = 32  # packets
 BIN_BITS = 15  # voxels of a bin, power of two
@@ -57,13 +56,6 @@ class Packets(NamedTuple):
     origins: np.ndarray
     directions: np.ndarray
     bases: np.ndarray
-
-
-class TreeValues(NamedTuple):
-    """density of `dense_densities`, and sh (N, 3 K)."""
-
-    density: np.ndarray
-    sh: np.ndarray
 
 
 class Limits(NamedTuple):
@@ -225,7 +217,7 @@ def _trace_packet(number, packets, targets, limits, sh, tree, arrays, rays, loss
     rays  RayScratch of as many as the packet has, or more
     """
     begin, end, origins, directions, basis = packets.first[number], packets.first[number + 1], packets.origins, packets.directions, packets.bases[number]
-    packet, terms, (ends, left, slopes) = packet_pointers(arrays), len(basis), rays
+    packet, terms, (ends, left, slopes) = pointers(arrays), len(basis), rays
     clear(packet, tree)
     way = clear_distance(begin, end, origins, directions, tree)
     for ray in range(begin, end):
@@ -254,7 +246,7 @@ def _trace_packet(number, packets, targets, limits, sh, tree, arrays, rays, loss
 @numba.njit(cache=True, error_model="numpy")
 def _leave_records(number, found, written, arrays, numbers, gradient, bins):
     """Records of the voxels that a packet found, from `written` on, counted by bins; returns their end."""
-    packet = packet_pointers(arrays)
+    packet = pointers(arrays)
     for n in range(found):
         slot, v = 4 * np.int64(packet.stored[2 * n]), packet.stored[2 * n + 1]
         numbers[written, 0], numbers[written, 1] = v, np.int32(number)
@@ -292,10 +284,9 @@ def _enlarged(values, count, room):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _work(task, cells, values, packets, targets, limits, numbers, gradient, begin, counts, loss):
+def _work(task, cells, sh, packets, targets, limits, numbers, gradient, begin, counts, loss):
     """Takes chunks until none is left. Chunk u writes its records from u * capacity on, and to counts[u] how many there are; more than `capacity`: none."""
-    first, density = packets.first, values.density
-    tree, flat = tree_pointers(cells, density), pointer(values.sh)
+    first, density, tree, flat = packets.first, cells.density, pointers(cells), pointer(sh)
     arrays = packet_arrays(np.int64(FIRST_BLOCKS), np.int64(FIRST_SAMPLES), tree.cube, density)
     rays = _ray_scratch(SSIM_WINDOW * SSIM_WINDOW)
     own_numbers, own_gradient = np.empty((128 * CHUNK, 2), np.int32), np.empty((128 * CHUNK, 4), density.dtype)
@@ -322,9 +313,9 @@ def _work(task, cells, values, packets, targets, limits, numbers, gradient, begi
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _forward_backward(workers, task, cells, values, packets, targets, limits, numbers, gradient, begin, counts, loss):
+def _forward_backward(workers, task, cells, sh, packets, targets, limits, numbers, gradient, begin, counts, loss):
     for _ in numba.prange(workers):
-        _work(task, cells, values, packets, targets, limits, numbers, gradient, begin, counts, loss)
+        _work(task, cells, sh, packets, targets, limits, numbers, gradient, begin, counts, loss)
 
 
 def forward_backward(
@@ -343,10 +334,10 @@ def forward_backward(
     chunks, bins = -(-(len(first) - 1) // CHUNK), (len(sh) >> BIN_BITS) + 1
     loss, counts, begin = np.zeros(len(origins)), np.zeros(chunks, np.int64), np.zeros((chunks, bins + 1), np.int64)
     buffer.reserve(chunks)
-    workers, packets, values = min(numba.get_num_threads(), max(chunks, 1)), Packets(first, origins, directions, bases), TreeValues(density, sh)
+    workers, packets, cells = min(numba.get_num_threads(), max(chunks, 1)), Packets(first, origins, directions, bases), cells.having(density)
     while True:
         limits = Limits(float(stop), buffer.capacity)
-        _forward_backward(workers, np.zeros(1, np.int64), cells, values, packets, targets, limits, buffer.numbers, buffer.gradient, begin, counts, loss)
+        _forward_backward(workers, np.zeros(1, np.int64), cells, sh, packets, targets, limits, buffer.numbers, buffer.gradient, begin, counts, loss)
         if not chunks or counts.max() <= buffer.capacity:
             return loss, Records(buffer.numbers, buffer.gradient, begin, bases)
         buffer.reserve(chunks, int(1.25 * counts.max()))

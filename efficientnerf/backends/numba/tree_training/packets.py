@@ -17,7 +17,7 @@ import numpy as np
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.march import cascade_distances, march_with
 from efficientnerf.backends.numba.tree_training.scalars import absorbed, cast_like
-from efficientnerf.backends.numba.vector.memory import pointer, prefetch
+from efficientnerf.backends.numba.vector.memory import prefetch
 
 FIRST_BLOCKS, FIRST_SAMPLES = 128, 1024  # that a packet has room for before it grows
 WORDS = 16  # of 4 bytes in a cache line
@@ -61,16 +61,6 @@ def packet_arrays(most, samples, cube, density):
     )  # fmt: skip
     arrays.state[BLOCKS] = 1
     return arrays
-
-
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def packet_pointers(a):
-    """The same with pointers."""
-    return PacketArrays(
-        a.most, a.samples, pointer(a.state), pointer(a.cell_table), pointer(a.cell_key), pointer(a.blocks), pointer(a.sources), pointer(a.brick_table),
-        pointer(a.owner), pointer(a.met), pointer(a.colour), pointer(a.gradient), pointer(a.stored),
-        pointer(a.slots), pointer(a.weights), pointer(a.light), pointer(a.shade),
-    )  # fmt: skip
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")

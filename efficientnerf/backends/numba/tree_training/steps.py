@@ -19,7 +19,7 @@ from efficientnerf.backends.numba.tree.cells import Cells, dense_densities, voxe
 from efficientnerf.backends.numba.tree_training.gradients import BIN_BITS, Records
 from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, Neighbours, differences
 from efficientnerf.backends.numba.vector.maths import broadcast, fma, lowest_bit, sum_lanes
-from efficientnerf.backends.numba.vector.memory import fetch_add, load, load_cycle, load_first, pointer, prefetch, store, store_first
+from efficientnerf.backends.numba.vector.memory import fetch_add, load, load_cycle, load_first, pointer, pointers, prefetch, store, store_first
 
 LANES = 16  # rows of coefficients, the three channels of one after those of the other, are read in groups of so many; the last may hold fewer
 AHEAD = 8  # voxels whose values are fetched before their turn
@@ -68,30 +68,21 @@ def values_of(cells: Cells, density: np.ndarray, sh: np.ndarray) -> Values:
     return Values(density, sh, places, dense_densities(cells, places, density), cascades, cells.scale * (cells.step_length / cells.step))
 
 
-class StepPointers(NamedTuple):
-    """What a step of one voxel reads and writes; without a comment: pointers to arrays of records, values, moments and hyperparameters."""
+class Step(NamedTuple):
+    """What a step of one voxel reads and writes: pointers, and tuples of these."""
 
-    numbers: Any
-    gradient: Any
+    records: Records
+    values: Values
+    moments: Moments
+    neighbours: Neighbours
     bases: Any  # (P, padded) of `rows_of`
     following: Any  # of `_link`
     row: Any  # (padded,) the gradient by a voxel's coefficients
     width: int  # 3 K
     padded: int
-    density: Any
-    sh: Any
-    places: Any
-    dense: Any
-    square_density: Any
-    square_sh: Any
-    visits: Any
-    sides: Any
-    cascades: Any
-    rates: Any
+    rates: Any  # (padded,)
     of_square: Any  # `corrections` of the moments, and the last one of these
     of_square_end: int
-    around: Any
-    brick: int
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -142,14 +133,14 @@ def _gather(number, p):
     """Sum of the records of a list into `p.row`; returns that by density, and the sum of the squares of the row."""
     by_density, squares, n = 0.0, broadcast(np.float32(0), LANES), number
     while n >= 0:
-        by_density += p.gradient[4 * p.following[2 * n] + 3]
+        by_density += p.records.gradient[4 * p.following[2 * n] + 3]
         n = p.following[2 * n + 1]
     for j in range(0, p.padded, LANES):
         total, n = broadcast(np.float32(0), LANES), number
         while n >= 0:
             at = p.following[2 * n]
-            basis = load(p.bases, p.padded * np.int64(p.numbers[2 * at + 1]) + j, LANES)
-            total = fma(basis, load_cycle(p.gradient, 4 * at, j, LANES), total)
+            basis = load(p.bases, p.padded * np.int64(p.records.numbers[2 * at + 1]) + j, LANES)
+            total = fma(basis, load_cycle(p.records.gradient, 4 * at, j, LANES), total)
             n = p.following[2 * n + 1]
         squares = fma(total, total, squares)
         store(p.row, j, total)
@@ -160,51 +151,40 @@ def _gather(number, p):
 def _update(v, by_density, squares, p, h):
     """A step of one voxel, whose gradient by coefficients is `p.row` and the sum of its squares `squares`."""
     decay, epsilon = h.decay, h.epsilon
-    visits = np.int64(min(p.visits[v] + 1, MAX_VISITS))
-    p.visits[v] = np.int32(visits)
-    correction, voxel = np.float64(p.of_square[min(visits, p.of_square_end)]), p.sides[p.cascades[v]]
+    visits = np.int64(min(p.moments.visits[v] + 1, MAX_VISITS))
+    p.moments.visits[v] = np.int32(visits)
+    correction, voxel = np.float64(p.of_square[min(visits, p.of_square_end)]), p.values.sides[p.values.cascades[v]]
     # With respect to the logarithm of the optical thickness; at least MIN_THICKNESS, so that density may appear.
-    thickness = max(p.density[v] * voxel, MIN_THICKNESS)
+    thickness = max(p.values.density[v] * voxel, MIN_THICKNESS)
     slope = by_density / voxel * thickness
-    square = decay * p.square_density[v] + (1 - decay) * slope * slope
-    p.square_density[v] = np.float32(square)
+    square = decay * p.moments.square_density[v] + (1 - decay) * slope * slope
+    p.moments.square_density[v] = np.float32(square)
     change = h.density_rate * slope / (np.sqrt(square * correction) + epsilon)
     if h.total_variation > 0:
         share = min(h.density_rate * h.total_variation, MOST_VARIATION)
-        change += share * differences(p.places[v], thickness, voxel, MIN_THICKNESS, p.brick, p.dense, p.around)
+        change += share * differences(p.values.places[v], thickness, voxel, MIN_THICKNESS, p.neighbours.brick, p.values.dense, p.neighbours.around)
     thickness = min(max(thickness * np.exp(-change), MIN_THICKNESS), MAX_THICKNESS)
-    p.density[v] = np.float32(thickness / voxel)
-    square = decay * p.square_sh[v] + (1 - decay) * squares / p.width
-    p.square_sh[v] = np.float32(square)
+    p.values.density[v] = np.float32(thickness / voxel)
+    square = decay * p.moments.square_sh[v] + (1 - decay) * squares / p.width
+    p.moments.square_sh[v] = np.float32(square)
     scale = np.float32(-1.0 / (np.sqrt(square * correction) + epsilon))
     for j in range(0, p.width, LANES):
         by, at, count = load(p.row, j, LANES), v * p.width + j, p.width - j
-        store_first(p.sh, at, fma(load(p.rates, j, LANES) * scale, by, load_first(p.sh, at, count, LANES)), count)
+        store_first(p.values.sh, at, fma(load(p.rates, j, LANES) * scale, by, load_first(p.values.sh, at, count, LANES)), count)
 
 
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
 def _fetch(v, number, p):
     """Bring what a step of a voxel with such a first record reads into the caches."""
-    prefetch(p.density, v)
-    prefetch(p.square_density, v)
-    prefetch(p.square_sh, v)
-    prefetch(p.visits, v)
-    prefetch(p.dense, p.places[v])
-    prefetch(p.gradient, 4 * p.following[2 * number])
+    prefetch(p.values.density, v)
+    prefetch(p.moments.square_density, v)
+    prefetch(p.moments.square_sh, v)
+    prefetch(p.moments.visits, v)
+    prefetch(p.values.dense, p.values.places[v])
+    prefetch(p.records.gradient, 4 * p.following[2 * number])
     for j in range(0, p.width, LANES):
-        prefetch(p.sh, v * p.width + j)
-    prefetch(p.sh, v * p.width + p.width - 1)
-
-
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def _step_pointers(records, rows, following, row, values, moments, neighbours, rates, of_square):
-    """See `StepPointers`."""
-    return StepPointers(
-        pointer(records.numbers), pointer(records.gradient), pointer(rows), pointer(following), pointer(row), values.sh.shape[1], rows.shape[1],
-        pointer(values.density), pointer(values.sh), pointer(values.places), pointer(values.dense),
-        pointer(moments.square_density), pointer(moments.square_sh), pointer(moments.visits), pointer(values.sides), pointer(values.cascades), pointer(rates),
-        pointer(of_square), len(of_square) - 1, pointer(neighbours.around), neighbours.brick,
-    )  # fmt: skip
+        prefetch(p.values.sh, v * p.width + j)
+    prefetch(p.values.sh, v * p.width + p.width - 1)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -217,12 +197,15 @@ def _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_sq
     while slab < bins:
         low = slab << BIN_BITS
         following = _link_all(low, slab, records, head, following, some)
-        p = _step_pointers(records, rows, following, row, values, moments, neighbours, rates, of_square)
+        p = Step(
+            pointers(records), pointers(values), pointers(moments), pointers(neighbours), pointer(rows), pointer(following), pointer(row), values.sh.shape[1],
+            rows.shape[1], pointer(rates), pointer(of_square), len(of_square) - 1,
+        )  # fmt: skip
         count = _take_voxels(some, met)
         for n in range(count):
             v = low + met[n]
             if n + 2 * AHEAD < count:
-                prefetch(p.places, low + met[n + 2 * AHEAD])
+                prefetch(p.values.places, low + met[n + 2 * AHEAD])
             if n + AHEAD < count:
                 _fetch(low + met[n + AHEAD], head[met[n + AHEAD]], p)
             by_density, squares = _gather(head[met[n]], p)

@@ -8,6 +8,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, overload
 
+from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.vector import emit
 from efficientnerf.backends.numba.vector.types import Vector, element_of
 
@@ -24,6 +25,22 @@ def pointer(typing_context: Any, array: Any) -> Any:
         return context.make_array(signature.args[0])(context, builder, args[0]).data
 
     return types.CPointer(array.dtype)(array), codegen
+
+
+@intrinsic
+def pointers(typing_context: Any, record: Any) -> Any:
+    """A NamedTuple with pointers to its arrays, see `pointer`; what is no array stays."""
+    for kind in record.types:
+        if isinstance(kind, types.Array) and kind.layout != "C":
+            raise TypeError(f"pointers of {record}: expected contiguous arrays")
+    result = types.BaseTuple.from_types([types.CPointer(kind.dtype) if isinstance(kind, types.Array) else kind for kind in record.types], record.instance_class)
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        fields = zip(record.types, cgutils.unpack_tuple(builder, args[0], len(record.types)), strict=True)
+        found = [context.make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else value for kind, value in fields]
+        return context.make_tuple(builder, signature.return_type, found)
+
+    return result(record), codegen
 
 
 @intrinsic
@@ -95,6 +112,20 @@ def store(typing_context: Any, address: Any, index: Any, value: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(address, types.int64, value), codegen
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def load_three(p, at, count):
+    """Three vectors that lie end to end, from p[at] on."""
+    return load(p, at, count), load(p, at + count, count), load(p, at + 2 * count, count)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def store_three(p, at, count, a, b, c):
+    """The reverse."""
+    store(p, at, a)
+    store(p, at + count, b)
+    store(p, at + 2 * count, c)
 
 
 def store_nth(out, n, value):

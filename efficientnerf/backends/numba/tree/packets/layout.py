@@ -11,12 +11,12 @@ colour; counts of coarse cells visited, of samples tested, of samples interpolat
 """
 
 LANES = 32  # rays of a packet; docs/experiments/renderer.md
-ENTRY_X, ENTRY_Y, ENTRY_Z, ALONG_X, ALONG_Y, ALONG_Z, FIRST, LAST = range(0, 8 * LANES, LANES)
-TRANSMITTANCE, RED, GREEN, BLUE, HALF_DISTANCE, PENDING_WEIGHT, GAIN = range(8 * LANES, 15 * LANES, LANES)
-VISITED, TESTED, INTERPOLATED, LOOKUPS, DEPTH, NORMAL_X, NORMAL_Y, NORMAL_Z = range(15 * LANES, 23 * LANES, LANES)
-X, Y, Z = range(23 * LANES, 26 * LANES, LANES)
+ENTRY, ALONG, FIRST, LAST = 0, 3 * LANES, 6 * LANES, 7 * LANES  # x, y and z of all rays, and so on
+TRANSMITTANCE, COLOUR, HALF_DISTANCE, PENDING_WEIGHT, GAIN = 8 * LANES, 9 * LANES, 12 * LANES, 13 * LANES, 14 * LANES
+VISITED, TESTED, INTERPOLATED, LOOKUPS, DEPTH, NORMAL = range(15 * LANES, 21 * LANES, LANES)
+PLACE = 23 * LANES
 SAMPLE = 26 * LANES
-SH_X, SH_Y, SH_Z, BASIS = range(30 * LANES, 34 * LANES, LANES)
+SH_ALONG, BASIS = 30 * LANES, 33 * LANES
 MOST_HARMONICS = 25
 CACHED_BITS = 7
 CACHED = 1 << CACHED_BITS  # colours of voxels near the camera that the rays of a packet share
@@ -32,7 +32,7 @@ BATCHES_OF_VOXELS = CACHE + CACHED
 BATCH_VOXELS = 4 * LANES
 INTS = BATCHES_OF_VOXELS + 2 * BATCH_VOXELS
 
-# float64: x, y, z of all rays, and so on; then by cascade where they enter and leave it
+# float64; then by cascade where they enter and leave it
 ORIGIN, DIRECTION, COSINE, BEGIN, ENDS = 0, 3 * LANES, 6 * LANES, 7 * LANES, 8 * LANES
 
 # The rays of a tile that are warped into normalised device coordinates, float64: origins and directions (n, 3), and what leads back: begin, ds_dt, dlogz_dt of

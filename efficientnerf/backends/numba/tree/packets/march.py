@@ -11,25 +11,9 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.march import PARALLEL, SKIP_MARGIN
+from efficientnerf.backends.numba.tree.packets import layout
 from efficientnerf.backends.numba.tree.packets.composite import blend, locate
-from efficientnerf.backends.numba.tree.packets.layout import (
-    ALONG_X,
-    ALONG_Y,
-    ALONG_Z,
-    BATCH_FLOATS,
-    BATCH_VOXELS,
-    BATCHES,
-    BATCHES_OF_VOXELS,
-    ENTRY_X,
-    ENTRY_Y,
-    ENTRY_Z,
-    FIRST,
-    LANES,
-    LAST,
-    OWNER,
-    TESTED,
-    VISITED,
-)
+from efficientnerf.backends.numba.tree.packets.layout import LANES
 from efficientnerf.backends.numba.vector.maths import (
     absolute,
     bits_of,
@@ -45,7 +29,7 @@ from efficientnerf.backends.numba.vector.maths import (
     to_float32,
     to_int32,
 )
-from efficientnerf.backends.numba.vector.memory import advanced, gather, load, prefetch, store
+from efficientnerf.backends.numba.vector.memory import advanced, gather, load, load_three, prefetch, store
 
 _HALF, _ONE, _NONE, _FAR = np.float32(0.5), np.float32(1), np.float32(0), np.float32(1e30)
 _SKIP = np.float32(0.5 + SKIP_MARGIN)
@@ -83,7 +67,7 @@ def _prefetch_rows(lanes, grid, ints):
     """Asks for the tables of rows of the bricks in OWNER, before the first sample there needs them: docs/experiments/renderer.md"""
     size, before = (grid.brick + 2) * (grid.brick + 2) * (1 if grid.narrow else 2), np.int64(-1)
     while lanes != 0:
-        owner = np.int64(ints[OWNER + lowest_bit(lanes)])
+        owner = np.int64(ints[layout.OWNER + lowest_bit(lanes)])
         if owner != before:
             prefetch(grid.rows, owner * size)
             prefetch(grid.rows, owner * size + _LINE)
@@ -101,8 +85,8 @@ def march(shared, grid, view, colours, floats, ints):
     shared  whether rays beside each other are neighbours
     view    see `View`; its density scale is the step, in units of the frame, times log2(e)
     """
-    ex, ey, ez = load(floats, ENTRY_X, LANES), load(floats, ENTRY_Y, LANES), load(floats, ENTRY_Z, LANES)
-    dx, dy, dz = load(floats, ALONG_X, LANES), load(floats, ALONG_Y, LANES), load(floats, ALONG_Z, LANES)
+    ex, ey, ez = load_three(floats, layout.ENTRY, LANES)
+    dx, dy, dz = load_three(floats, layout.ALONG, LANES)
     side, words = grid.brick + 2, 2 * grid.mask_words
     width, per_brick = np.float32(grid.brick), np.float32(1 / grid.brick)
     row, layer = np.float32(side), np.float32(side * side)
@@ -116,12 +100,12 @@ def march(shared, grid, view, colours, floats, ints):
     octant = select(dx > _NONE, cells, 0) + select(dy > _NONE, 2 * cells, 0)
     octant = octant + select(dz > _NONE, 4 * cells, 0)
     # Integers are kept as float32: conversions would lengthen the dependency chain from step to step.
-    k, last = load(floats, FIRST, LANES), load(floats, LAST, LANES)
+    k, last = load(floats, layout.FIRST, LANES), load(floats, layout.LAST, LANES)
     until, owner, visited, tested = k, broadcast(np.int32(0), LANES), broadcast(_NONE, LANES), broadcast(_NONE, LANES)
     bx = by = bz = px = py = pz = distance = broadcast(_NONE, LANES)
     going, ready, close = bits_of(k < last), np.int64(0), np.int64(0)
     pending, near, at = np.int64(0), np.int64(0), 0  # the batch before, whose colours have been asked for; which of them are near the camera
-    batches, voxels = advanced(floats, BATCHES), advanced(ints, BATCHES_OF_VOXELS)
+    batches, voxels = advanced(floats, layout.BATCHES), advanced(ints, layout.BATCHES_OF_VOXELS)
     while going != 0:
         lanes = mask_of(going, LANES)
         enters = lanes & (k >= until)
@@ -146,7 +130,7 @@ def march(shared, grid, view, colours, floats, ints):
             filled = bits_of(full)
             if filled != 0:
                 owner = select(full, gather(grid.brick_index, select(full, cell, 0)), owner)
-                store(ints, OWNER, owner)
+                store(ints, layout.OWNER, owner)
                 _prefetch_rows(filled, grid, ints)
                 bx = select(full, ex - a * width + _HALF, bx)
                 by = select(full, ey - e * width + _HALF, by)
@@ -167,16 +151,16 @@ def march(shared, grid, view, colours, floats, ints):
         going = bits_of(k < last) & ~ready & going
         if ready != 0 and popcount(ready) >= popcount(going):
             ended = np.int64(0)
-            locate(px, py, pz, distance, owner, grid, colours, ints, advanced(batches, BATCH_FLOATS * at), advanced(voxels, BATCH_VOXELS * at))
+            locate(px, py, pz, distance, owner, grid, colours, ints, advanced(batches, layout.BATCH_FLOATS * at), advanced(voxels, layout.BATCH_VOXELS * at))
             at = 1 - at
             if pending != 0:
-                batch, of_batch = advanced(batches, BATCH_FLOATS * at), advanced(voxels, BATCH_VOXELS * at)
+                batch, of_batch = advanced(batches, layout.BATCH_FLOATS * at), advanced(voxels, layout.BATCH_VOXELS * at)
                 ended = blend(pending, pending & near, shared, grid, view, colours, floats, ints, batch, of_batch)
             pending, near = ready & ~ended, close
             going, ready = (going | (ready & bits_of(k < last))) & ~ended, np.int64(0)
     if pending != 0:
         at = 1 - at
-        batch, of_batch = advanced(batches, BATCH_FLOATS * at), advanced(voxels, BATCH_VOXELS * at)
+        batch, of_batch = advanced(batches, layout.BATCH_FLOATS * at), advanced(voxels, layout.BATCH_VOXELS * at)
         blend(pending, pending & near, shared, grid, view, colours, floats, ints, batch, of_batch)
-    store(floats, VISITED, load(floats, VISITED, LANES) + visited)
-    store(floats, TESTED, load(floats, TESTED, LANES) + tested)
+    store(floats, layout.VISITED, load(floats, layout.VISITED, LANES) + visited)
+    store(floats, layout.TESTED, load(floats, layout.TESTED, LANES) + tested)

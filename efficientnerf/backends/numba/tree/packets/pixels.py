@@ -5,22 +5,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.tree.packets.layout import (
-    BLUE,
-    DEPTH,
-    GREEN,
-    INTERPOLATED,
-    LANES,
-    LOOKUPS,
-    NORMAL_X,
-    RED,
-    TESTED,
-    TRANSMITTANCE,
-    VISITED,
-)
+from efficientnerf.backends.numba.tree.packets import layout
+from efficientnerf.backends.numba.tree.packets.layout import LANES
 from efficientnerf.backends.numba.tree.ray_batch import normal_in_world, world_depth
 from efficientnerf.backends.numba.vector.maths import sum_lanes, to_float32, to_float64, to_int32
-from efficientnerf.backends.numba.vector.memory import load, store_rows
+from efficientnerf.backends.numba.vector.memory import load, load_three, store_rows
 
 INTERPOLATION, LOOKUP = 8, 32  # work of a sample interpolated and of a colour looked up, in samples tested
 
@@ -45,9 +34,10 @@ def _unwarp_packet(tile, voxel, rays, scratch, with_normal):
     for row in range(tile.upper, tile.lower):
         begin = (row - tile.top) * (tile.right - tile.left) - tile.left
         for n in range(begin + tile.first, begin + tile.last):
-            if floats[DEPTH + lane] < np.inf:
-                along, x, y, z = floats[DEPTH + lane] * voxel, NORMAL_X + lane, NORMAL_X + LANES + lane, NORMAL_X + 2 * LANES + lane
-                floats[DEPTH + lane] = world_depth(n, along, scratch.warped)
+            if floats[layout.DEPTH + lane] < np.inf:
+                along, x = floats[layout.DEPTH + lane] * voxel, layout.NORMAL + lane
+                y, z = x + LANES, x + 2 * LANES
+                floats[layout.DEPTH + lane] = world_depth(n, along, scratch.warped)
                 if with_normal:
                     floats[x], floats[y], floats[z] = normal_in_world(n, along, floats[x], floats[y], floats[z], rays.ndc, scratch.warped)
             lane += 1
@@ -56,12 +46,12 @@ def _unwarp_packet(tile, voxel, rays, scratch, with_normal):
 @numba.njit(cache=True, error_model="numpy")
 def _write_rows(tile, background, scale, floats, outputs):
     """Colours, opacities and depths of a packet of four rows of eight pixels, in lanes."""
-    first, width, transmittance = tile.upper * outputs.width + tile.first, outputs.width, load(floats, TRANSMITTANCE, LANES)
-    red, green, blue = load(floats, RED, LANES), load(floats, GREEN, LANES), load(floats, BLUE, LANES)
+    first, width, transmittance = tile.upper * outputs.width + tile.first, outputs.width, load(floats, layout.TRANSMITTANCE, LANES)
+    red, green, blue = load_three(floats, layout.COLOUR, LANES)
     red, green, blue = red + transmittance * background[0], green + transmittance * background[1], blue + transmittance * background[2]
     store_rows(outputs.colour, 3 * first, 3 * width, (red, green, blue), 8)
     store_rows(outputs.opacity, first, width, (_ONE - transmittance,), 8)
-    store_rows(outputs.depth, first, width, (to_float32(to_float64(load(floats, DEPTH, LANES)) * scale),), 8)
+    store_rows(outputs.depth, first, width, (to_float32(to_float64(load(floats, layout.DEPTH, LANES)) * scale),), 8)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -71,10 +61,10 @@ def _write_pixels(tile, background, scale, floats, outputs):
     for row in range(tile.upper, tile.lower):
         for pixel in range(row * outputs.width + tile.first, row * outputs.width + tile.last):
             for c in range(3):
-                outputs.colour[3 * pixel + c] = floats[RED + LANES * c + lane] + floats[TRANSMITTANCE + lane] * background[c]
+                outputs.colour[3 * pixel + c] = floats[layout.COLOUR + LANES * c + lane] + floats[layout.TRANSMITTANCE + lane] * background[c]
                 if outputs.with_normal:
-                    outputs.normal[3 * pixel + c] = floats[NORMAL_X + LANES * c + lane]
-            outputs.opacity[pixel], outputs.depth[pixel] = _ONE - floats[TRANSMITTANCE + lane], floats[DEPTH + lane] * scale
+                    outputs.normal[3 * pixel + c] = floats[layout.NORMAL + LANES * c + lane]
+            outputs.opacity[pixel], outputs.depth[pixel] = _ONE - floats[layout.TRANSMITTANCE + lane], floats[layout.DEPTH + lane] * scale
             lane += 1
 
 
@@ -102,5 +92,6 @@ def write_packet(tile, background, voxel, rays, scratch, outputs):
         _write_rows(tile, background, scale, floats, outputs)
     else:
         _write_pixels(tile, background, scale, floats, outputs)
-    work = to_int32(load(floats, VISITED, LANES) + load(floats, TESTED, LANES)) + to_int32(load(floats, INTERPOLATED, LANES)) * INTERPOLATION
-    return count + sum_lanes(work + to_int32(load(floats, LOOKUPS, LANES)) * LOOKUP)
+    visited, tested, interpolated = load_three(floats, layout.VISITED, LANES)
+    work = to_int32(visited + tested) + to_int32(interpolated) * INTERPOLATION
+    return count + sum_lanes(work + to_int32(load(floats, layout.LOOKUPS, LANES)) * LOOKUP)

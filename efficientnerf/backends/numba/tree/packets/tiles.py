@@ -6,43 +6,24 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.normals import add_normals
+from efficientnerf.backends.numba.tree.packets import layout
 from efficientnerf.backends.numba.tree.packets.beginnings import begin_part, begin_rays
-from efficientnerf.backends.numba.tree.packets.layout import (
-    ALONG_X,
-    ALONG_Y,
-    ALONG_Z,
-    BEGIN,
-    COSINE,
-    DEPTH,
-    ENTRY_X,
-    ENTRY_Y,
-    ENTRY_Z,
-    HALF_DISTANCE,
-    LANES,
-    X,
-    Y,
-    Z,
-)
+from efficientnerf.backends.numba.tree.packets.layout import LANES
 from efficientnerf.backends.numba.tree.packets.march import march
 from efficientnerf.backends.numba.tree.packets.pixels import write_clear, write_packet
 from efficientnerf.backends.numba.tree.ray_batch import PINHOLE, clear_distance, tile_rays
-from efficientnerf.backends.numba.tree.view_colours import PackedPointers, View
+from efficientnerf.backends.numba.tree.view_colours import PackedPointers, View, Views
 from efficientnerf.backends.numba.vector.memory import advanced
 
 
 class Scene(NamedTuple):
-    """All cascades of a packed tree, and the views of them, with arrays as pointers; see `Packed` and `Views`. `base` is cascade 0."""
+    """All cascades of a packed tree, of which `base` is the first, and the views of them, with arrays as pointers; see `Packed`."""
 
     cascades: int
     base: PackedPointers
     grids: Any
     places: Any
-    direction: Any
-    direction_rate: float
-    min_distance: Any
-    density_scale: Any
-    step: float
-    degree: int
+    views: Views
 
 
 class Tile(NamedTuple):
@@ -84,7 +65,8 @@ def _cascade(n, scene):
         base.mask_words, base.rows, base.narrow, base.voxels, base.voxel_of, advanced(base.brick_index, first), base.density, base.terms, base.coded,
         base.sh, base.base, base.base_table, base.codes, base.groups, base.palette, base.entries, base.code_columns,
     )  # fmt: skip
-    return grid, View(advanced(scene.direction, 12 * n), scene.direction_rate, scene.min_distance[n], scene.density_scale[n], scene.step, scene.degree)
+    views = scene.views
+    return grid, View(advanced(views.direction, 12 * n), views.direction_rate, views.min_distance[n], views.density_scale[n], views.step, views.degree)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -133,15 +115,14 @@ def _end_part(count, grid, with_normal, scratch):
     """Depths, voxels of cascade 0, and normals of the rays that lost half of their light in a part."""
     floats, places, found = scratch.floats, scratch.rays, np.int64(0)
     for lane in range(count):
-        distance = floats[HALF_DISTANCE + lane]
-        if distance < np.inf and floats[DEPTH + lane] == np.inf:
-            floats[DEPTH + lane] = (places[BEGIN + lane] + distance) * grid.ratio * places[COSINE + lane]
-            floats[X + lane] = floats[ENTRY_X + lane] + distance * floats[ALONG_X + lane]
-            floats[Y + lane] = floats[ENTRY_Y + lane] + distance * floats[ALONG_Y + lane]
-            floats[Z + lane] = floats[ENTRY_Z + lane] + distance * floats[ALONG_Z + lane]
+        distance = floats[layout.HALF_DISTANCE + lane]
+        if distance < np.inf and floats[layout.DEPTH + lane] == np.inf:
+            floats[layout.DEPTH + lane] = (places[layout.BEGIN + lane] + distance) * grid.ratio * places[layout.COSINE + lane]
+            for n in range(lane, lane + 3 * LANES, LANES):
+                floats[layout.PLACE + n] = floats[layout.ENTRY + n] + distance * floats[layout.ALONG + n]
             found |= np.int64(1) << lane
     if with_normal and found != 0:
-        add_normals(found, X, Y, Z, grid, floats)
+        add_normals(found, grid, floats)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -154,7 +135,7 @@ def _render_packet(tile, rays, scene, colours, with_normal, scratch):
         if clear == np.inf:
             continue
         grid, view = _cascade(n, scene)
-        if begin_part(part, count, clear, grid, scene.step, rays, scratch):
+        if begin_part(part, count, clear, grid, scene.views.step, rays, scratch):
             march(tile.low - tile.top > 1, grid, view, colours, scratch.floats, scratch.ints)
             _end_part(count, grid, with_normal, scratch)
 
