@@ -24,6 +24,7 @@ from torch import Tensor
 from efficientnerf.asset.cascades import voxel_cascades
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.layout import SSIM_C1, SSIM_C2, SSIM_WINDOW, RayTargets
+from efficientnerf.backends.structure import structure_change
 from efficientnerf.backends.triton.harmonics import basis_columns
 from efficientnerf.backends.triton.launch import INTERPRETED, blocks
 from efficientnerf.backends.triton.tree import brick_arrays, device_cascades
@@ -286,9 +287,8 @@ def _structure_slopes(error: Tensor, wanted: Tensor, windows: Tensor) -> Tensor:
     x = y + error[rays]
     of_x, of_y = x.mean(1, keepdim=True), y.mean(1, keepdim=True)
     x, y = x - of_x, y - of_y
-    means, deviations = of_x**2 + of_y**2 + SSIM_C1, (x * x + y * y).mean(1, keepdim=True) + SSIM_C2
-    same_mean, together = (2 * of_x * of_y + SSIM_C1) / means, (2 * (x * y).mean(1, keepdim=True) + SSIM_C2) / deviations
-    change = (y - x * together) * (same_mean / deviations) + (of_y - of_x * same_mean) * (together / means)
+    squares, products = (x * x + y * y).mean(1, keepdim=True), (x * y).mean(1, keepdim=True)
+    change = structure_change(x, y, of_x, of_y, squares, products, SSIM_C1, SSIM_C2, 2)
     slopes = torch.zeros_like(error)
     slopes[rays.reshape(-1)] = -change.reshape(-1, 3)
     return slopes

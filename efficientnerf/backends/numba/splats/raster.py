@@ -20,9 +20,11 @@ from efficientnerf.backends.numba.splats.projection import LANES
 from efficientnerf.backends.numba.vector.maths import LOG2_E, bits_of, broadcast, exp2_neg, mask_of, maximum, minimum, select, sum_each, sum_lanes
 from efficientnerf.backends.numba.vector.memory import fetch_add, load, load_three, pointer, store, store_three
 from efficientnerf.backends.splat_layout import RECORD, SUMS, TILE, Picture
+from efficientnerf.backends.structure import structure_change
 
 _NONE, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _C1, _C2 = np.float32(SSIM_C1), np.float32(SSIM_C2)
+_structure_change = numba.njit(inline="always", error_model="numpy")(structure_change)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -116,9 +118,7 @@ def _add_structure(p, picture):
         x = y + difference
         of_x, of_y = sum_lanes(x) * share, sum_lanes(y) * share
         x, y = x - of_x, y - of_y
-        means, deviations = of_x * of_x + of_y * of_y + _C1, sum_lanes(x * x + y * y) * share + _C2
-        same_mean, together = (_TWO * of_x * of_y + _C1) / means, (_TWO * sum_lanes(x * y) * share + _C2) / deviations
-        change = (y - x * together) * (same_mean / deviations) + (of_y - of_x * same_mean) * (together / means)
+        change = _structure_change(x, y, of_x, of_y, sum_lanes(x * x + y * y) * share, sum_lanes(x * y) * share, _C1, _C2, _TWO)
         store(p, 16 * channel, difference - change * picture.structure)
         by_light = by_light - change * (picture.structure * (_HALF if picture.over_all else picture.background[channel]))
     store(p, 48, by_light)

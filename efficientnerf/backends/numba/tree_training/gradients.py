@@ -35,9 +35,11 @@ from efficientnerf.backends.numba.tree_training.scalars import cast_like, sigmoi
 from efficientnerf.backends.numba.vector.corners import mix_corners, spread_corners
 from efficientnerf.backends.numba.vector.maths import fma
 from efficientnerf.backends.numba.vector.memory import fetch_add, pointer, pointers, prefetch
+from efficientnerf.backends.structure import structure_change
 
 CHUNK = 32  # packets
 BIN_BITS = 15  # voxels of a bin, power of two
+_structure_change = numba.njit(inline="always", error_model="numpy")(structure_change)
 
 
 class Records(NamedTuple):
@@ -172,13 +174,10 @@ def _add_structure(begin, end, targets, slopes):
             x, y = y + slopes[ray - begin, channel] - of_x, y - of_y
             squares += share * (x * x + y * y)
             products += share * x * y
-        means, deviations = of_x * of_x + of_y * of_y + SSIM_C1, squares + SSIM_C2
-        same_mean, together = (2 * of_x * of_y + SSIM_C1) / means, (2 * products + SSIM_C2) / deviations
         for ray in range(begin, end):
             y = np.float64(targets.colour[ray, channel])
             x, y = y + slopes[ray - begin, channel] - of_x, y - of_y
-            change = (y - x * together) * (same_mean / deviations) + (of_y - of_x * same_mean) * (together / means)
-            slopes[ray - begin, channel] -= targets.structure * change
+            slopes[ray - begin, channel] -= targets.structure * _structure_change(x, y, of_x, of_y, squares, products, SSIM_C1, SSIM_C2, 2.0)
 
 
 @numba.njit(cache=True, error_model="numpy")
