@@ -14,7 +14,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from efficientnerf.backends.numba.runtime import PRANGE, numba
-from efficientnerf.backends.numba.vector.memory import advanced, pointer
+from efficientnerf.backends.numba.vector.memory import advanced, pointer, pointers
 
 BITS = 14  # of probabilities
 SLOTS = 1 << BITS
@@ -40,17 +40,11 @@ class Coder(NamedTuple):
 
 
 class Slice(NamedTuple):
-    """Where one slice of a coder lies: pointers, which no reference count slows down, and the end of its words."""
+    """One slice of a coder: this with pointers, which no reference count slows down, the end of the slice's words, and its states."""
 
-    reads: Any
-    end: Any
+    coder: Coder
+    end: int
     state: Any
-    words: Any
-    table: Any
-    symbol: Any
-    shares: Any
-    symbols: Any
-    contexts: Any
 
 
 @intrinsic
@@ -65,11 +59,7 @@ def digits(typing_context: Any, value: Any) -> Any:
 
 @numba.njit(inline="always")
 def slice_of(coder, s):
-    reads, state, _, end, _, words, table, symbol, shares, symbols, contexts = coder
-    return Slice(
-        reads, end[s], advanced(pointer(state), s * state.shape[1]), pointer(words), pointer(table), pointer(symbol), pointer(shares), pointer(symbols),
-        pointer(contexts),
-    )  # fmt: skip
+    return Slice(pointers(coder), coder.end[s], advanced(pointer(coder.state), s * coder.state.shape[1]))
 
 
 @numba.njit(inline="always")
@@ -77,60 +67,34 @@ def _refilled(one, lane, x, at):
     """Keep the state of a lane, with a word more if it is low: where the next word is, and 1 if there was none."""
     low = np.int64(x < LOWEST)
     there = low & np.int64(at < one.end)
-    word = np.int64(one.words[at])
+    word = np.int64(one.coder.words[at])
     one.state[lane] = (x << (low << 4)) | (word & -low)
     return at + there, low ^ there
 
 
 @numba.njit(inline="always")
-def coded(one, lane, context, value, at):
+def coded(one, lane, context, value, at, few):
     """The next symbol of a slice, read, or `value`, which is recorded; where it goes on; and 1 if words ran out.
 
     lane  whose state it is; the same for all symbols of a context
     at    where the slice is
+    few   2 or 4, if the tables of the context have no more symbols: what slots stand for is not looked up then; else 0
     """
-    if not one.reads:
-        one.symbols[at] = value
-        one.contexts[at] = context
+    coder = one.coder
+    if not coder.reads:
+        coder.symbols[at] = value
+        coder.contexts[at] = context
         return np.int64(value), at + 1, np.int64(0)
-    row = np.int64(one.table[context])
-    x = one.state[lane]
+    table = np.int64(coder.table[context])
+    row, x = table << 8, one.state[lane]
     slot = x & (SLOTS - 1)
-    found = np.int64(one.symbol[(row << BITS) + slot])
-    share = np.int64(one.shares[(row << 8) + found])
-    at, lacking = _refilled(one, lane, (share & 0xFFFF) * (x >> BITS) + slot - (share >> 16), at)
-    return found, at, lacking
-
-
-@numba.njit(inline="always")
-def coded_bit(one, lane, context, value, at):
-    """As `coded`, of a context whose tables have the symbols 0 and 1 alone: what slots stand for is not looked up."""
-    if not one.reads:
-        one.symbols[at] = value
-        one.contexts[at] = context
-        return np.int64(value), at + 1, np.int64(0)
-    row = np.int64(one.table[context]) << 8
-    x = one.state[lane]
-    slot = x & (SLOTS - 1)
-    found = np.int64(slot >= np.int64(one.shares[row + 1]) >> 16)
-    share = np.int64(one.shares[row + found])
-    at, lacking = _refilled(one, lane, (share & 0xFFFF) * (x >> BITS) + slot - (share >> 16), at)
-    return found, at, lacking
-
-
-@numba.njit(inline="always")
-def coded_few(one, lane, context, value, at):
-    """As `coded_bit`, of the symbols 0 to 3."""
-    if not one.reads:
-        one.symbols[at] = value
-        one.contexts[at] = context
-        return np.int64(value), at + 1, np.int64(0)
-    row = np.int64(one.table[context]) << 8
-    x = one.state[lane]
-    slot = x & (SLOTS - 1)
-    found = np.int64(slot >= np.int64(one.shares[row + 1]) >> 16) + np.int64(slot >= np.int64(one.shares[row + 2]) >> 16)
-    found += np.int64(slot >= np.int64(one.shares[row + 3]) >> 16)
-    share = np.int64(one.shares[row + found])
+    if few == 0:
+        found = np.int64(coder.symbol[(table << BITS) + slot])
+    else:
+        found = np.int64(slot >= np.int64(coder.shares[row + 1]) >> 16)
+        if few == 4:
+            found += np.int64(slot >= np.int64(coder.shares[row + 2]) >> 16) + np.int64(slot >= np.int64(coder.shares[row + 3]) >> 16)
+    share = np.int64(coder.shares[row + found])
     at, lacking = _refilled(one, lane, (share & 0xFFFF) * (x >> BITS) + slot - (share >> 16), at)
     return found, at, lacking
 

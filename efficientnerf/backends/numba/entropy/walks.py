@@ -8,7 +8,7 @@ B bricks, N stored voxels, b voxels along a side of a brick, S slices, G groups 
 
 import numpy as np
 
-from efficientnerf.backends.numba.entropy.rans import coded, coded_bit, coded_few, digits, slice_of
+from efficientnerf.backends.numba.entropy.rans import coded, digits, slice_of
 from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.vector.memory import hold, pointer
 
@@ -33,7 +33,7 @@ def walk_cells(coder, cells, begin, end):
                 a, b, c = cells[x - 1, y, z], cells[x, y - 1, z], cells[x, y, z - 1]
                 d, e, f, g = cells[x - 1, y - 1, z], cells[x - 1, y, z - 1], cells[x, y - 1, z - 1], cells[x - 1, y - 1, z - 1]
                 context = a | b << 1 | c << 2 | d << 3 | e << 4 | f << 5 | g << 6
-                value, at, lacking = coded_bit(one, 0, context, cells[x, y, z], at)
+                value, at, lacking = coded(one, 0, context, cells[x, y, z], at, 2)
                 failed |= lacking
                 cells[x, y, z] = value
     coder.at[0], coder.failed[0] = at, failed
@@ -54,7 +54,7 @@ def _walk_masks(coder, s, stored, before, border, inner, b, begin, end):
             context = np.int64(near[p - plane]) | np.int64(near[p - side]) << 1 | np.int64(near[p - 1]) << 2
             context |= np.int64(near[p - plane - side]) << 3 | np.int64(near[p - plane - 1]) << 4
             context |= np.int64(near[p - side - 1]) << 5 | np.int64(near[p - plane - side - 1]) << 6
-            value, at, lacking = coded_bit(one, 0, context, voxels[n * cube + v], at)
+            value, at, lacking = coded(one, 0, context, voxels[n * cube + v], at, 2)
             failed |= lacking
             near[p] = value
             voxels[n * cube + v] = value
@@ -137,7 +137,7 @@ def _walk_densities(coder, s, codes, neighbours, entries, begin, end):
     one, at, failed = slice_of(coder, s), coder.at[s], coder.failed[s]
     values, near, length = pointer(codes), pointer(neighbours), np.uint32(entries)
     for n in range(begin, end):
-        value, at, lacking = coded(one, 0, density_context(values, near, n, np.int64(length)), values[n], at)
+        value, at, lacking = coded(one, 0, density_context(values, near, n, np.int64(length)), values[n], at, 0)
         failed |= lacking
         values[n] = value
     coder.at[s], coder.failed[s] = at, failed
@@ -173,22 +173,25 @@ def base_prediction(codes, neighbours, entries, n, channel):
     return min(max(predicted + difference, 0), entries - 1), 8 + 32 * channel + 8 * spread + min(digits(abs(difference)), 7)
 
 
+@numba.njit(forceinline=True)
+def _base(one, lane, codes, neighbours, entries, n, channel, at):
+    """The code of a channel of a voxel; where the slice goes on, and 1 if words ran out."""
+    predicted, context = base_prediction(codes, neighbours, entries, n, channel)
+    symbol, at, lacking = coded(one, lane, context, (np.int64(codes[3 * n + channel]) - predicted) & 255, at, 0)
+    codes[3 * n + channel] = (predicted + symbol) & 255
+    return at, lacking
+
+
 @numba.njit
 def _walk_bases(coder, s, codes, neighbours, entries, begin, end):
     one, at, failed = slice_of(coder, s), coder.at[s], coder.failed[s]
     values, near = pointer(codes), pointer(neighbours)
     for n in range(begin, end):
-        predicted, context = base_prediction(values, near, entries, n, 1)
-        symbol, at, lacking = coded(one, 0, context, (np.int64(values[3 * n + 1]) - predicted) & 255, at)
-        values[3 * n + 1] = (predicted + symbol) & 255
+        at, lacking = _base(one, 0, values, near, entries, n, 1, at)
         failed |= lacking
-        predicted, context = base_prediction(values, near, entries, n, 0)
-        symbol, at, lacking = coded(one, 1, context, (np.int64(values[3 * n]) - predicted) & 255, at)
-        values[3 * n] = (predicted + symbol) & 255
+        at, lacking = _base(one, 1, values, near, entries, n, 0, at)
         failed |= lacking
-        predicted, context = base_prediction(values, near, entries, n, 2)
-        symbol, at, lacking = coded(one, 2, context, (np.int64(values[3 * n + 2]) - predicted) & 255, at)
-        values[3 * n + 2] = (predicted + symbol) & 255
+        at, lacking = _base(one, 2, values, near, entries, n, 2, at)
         failed |= lacking
     coder.at[s], coder.failed[s] = at, failed
 
@@ -235,18 +238,18 @@ def _walk_codes(coder, s, codes, neighbours, densities, quarters, shift, begin, 
             kinds, second, agreement, length = known_codes(count, a, b, c, shift)
             value = np.int64(values[n * groups + g])
             symbol = NEW
-            if not one.reads:
+            if not coder.reads:
                 symbol = NEW if kinds == 0 else 0 if value == a else 1 if value == second and kinds > 1 else 2 if value == c and kinds > 2 else NEW
             o = each * g
-            symbol, at, lacking = coded_few(one, g, o + 16 * agreement + situation, symbol, at)
+            symbol, at, lacking = coded(one, g, o + 16 * agreement + situation, symbol, at, 4)
             failed |= lacking | (np.int64(symbol >= kinds) & np.int64(symbol != NEW))  # names no neighbour
             if symbol == NEW:
-                leading, at, lacking = coded(one, g, o + REPEAT_CONTEXTS + 16 * length + situation, value >> shift, at)
+                leading, at, lacking = coded(one, g, o + REPEAT_CONTEXTS + 16 * length + situation, value >> shift, at, 0)
                 failed |= lacking
                 situation = 4 * newness(leading) + beside
                 value = leading
                 if shift:
-                    low, at, lacking = coded(one, g, o + REPEAT_CONTEXTS + CODE_CONTEXTS + leading, np.int64(values[n * groups + g]) & 255, at)
+                    low, at, lacking = coded(one, g, o + REPEAT_CONTEXTS + CODE_CONTEXTS + leading, np.int64(values[n * groups + g]) & 255, at, 0)
                     failed |= lacking
                     value = leading << 8 | low
             else:
