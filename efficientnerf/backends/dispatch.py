@@ -39,7 +39,6 @@ OPERATIONS: dict[str, dict[Backend, str]] = {
     "scaled_by_distance": {"torch": "rendering.compositing", "numba": "backends.numba.operations"},
     "basis": {"torch": "rendering.harmonics", "numba": "backends.numba.operations"},
     "sparse_depth_errors": {"torch": "backends.torch.sparse_depth", "numba": "backends.numba.operations"},
-    "encode": {"torch": "backends.torch.hash_grid", "numba": "backends.numba.operations", "triton": "backends.triton.hash_grid"},
     "hash_network": {"torch": "backends.torch.hash_grid", "numba": "backends.numba.operations", "triton": "backends.triton.hash_grid"},
     "update_occupancy_maximum": {"torch": "backends.torch.occupancy", "numba": "backends.numba.operations"},
     "random_cells": {"torch": "backends.torch.occupancy", "numba": "backends.numba.operations"},
@@ -172,15 +171,10 @@ def sparse_depth_errors(weight: Tensor, start: Tensor, extent: Tensor, first: Te
     return errors(weight, start, extent, first, distance, on_support, width)
 
 
-def encode(points: Tensor, table: Tensor, levels: HashLevels, gradient: GradientBuffer) -> Tensor:
-    """See `efficientnerf.backends.torch.hash_grid.encode`. With numba the gradient of the table is added to the buffer, not handed to autograd."""
-    return implementation("encode", backend_of(points, table))(points, table, levels, gradient)
-
-
 def hash_network(
     points: Tensor, table: Tensor, levels: HashLevels, weights: Sequence[Tensor], offset: float, precision: torch.dtype, gradient: GradientBuffer
 ) -> Tensor:
-    """See `efficientnerf.backends.torch.hash_grid.hash_network`; the gradient of the table as for `encode`."""
+    """See `efficientnerf.backends.torch.hash_grid.hash_network`. With numba the gradient of the table is added to the buffer, not handed to autograd."""
     return implementation("hash_network", backend_of(points, table))(points, table, levels, weights, offset, precision, gradient)
 
 

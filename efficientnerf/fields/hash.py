@@ -68,10 +68,6 @@ class HashField(BakeableField):
     def density(self, points: Tensor) -> Tensor:
         return self._network(points, self.weights[-1][:1])[:, 0]
 
-    def encode(self, points: Tensor) -> Tensor:
-        """Features (N, 2L) at points (N, 3) in grid coordinates; differentiable in the table."""
-        return dispatch.encode(points, self.table, self.hash_levels, self.table_gradient)
-
     def _network(self, points: Tensor, last: Tensor) -> Tensor:
         weights = [*list(self.weights)[:-1], last]
         training = torch.is_grad_enabled() and dispatch.backend_of(points, self.table) != "torch"

@@ -1,7 +1,7 @@
 """The numba kernels as operations on float32 tensors of the CPU: the functions that `efficientnerf.backends.dispatch` calls."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -129,42 +129,10 @@ class _SparseDepthErrors(torch.autograd.Function):
         return grad_weight, None, None, None, None, None, None
 
 
-def encode(points: Tensor, table: Tensor, levels: HashLevels, gradient: GradientBuffer) -> Tensor:
-    """Differentiable in the table, whose gradient is added to the buffer `gradient`, not handed to autograd."""
-    return _Encode.apply(points, table, levels, gradient)
-
-
-def _encoded(points: Tensor, table: Tensor, levels: HashLevels) -> tuple[Tensor, Tensor]:
-    """Points (3, N) and features (F L, N): the order that the kernels want."""
-    transposed, out = torch.empty(3, len(points)), torch.empty(table.shape[1] * len(levels.sides), len(points))
-    hash_grid.transpose_points(_array(points), transposed.numpy())
-    hash_grid.encode(transposed.numpy(), table.detach().numpy(), *levels, out.numpy())
-    return transposed, out
-
-
-def _add_table_gradient(points: Tensor, grad: Tensor, table: Tensor, levels: HashLevels, gradient: GradientBuffer) -> None:
-    """Add to the buffer for gradients (F L, N) of the features at points (3, N)."""
-    hash_grid.encode_backward(points.numpy(), grad.numpy(), *levels, gradient.accumulator(table).numpy())
-
-
-class _Encode(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, points: Tensor, table: Tensor, levels: HashLevels, gradient: GradientBuffer) -> Tensor:
-        at, out = _encoded(points, table, levels)
-        ctx.save_for_backward(at)
-        ctx.table, ctx.levels, ctx.gradient = table, levels, gradient
-        return out.t()
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[None, ...]:
-        _add_table_gradient(ctx.saved_tensors[0], grad.t().contiguous(), ctx.table, ctx.levels, ctx.gradient)
-        return None, None, None, None
-
-
 def hash_network(
     points: Tensor, table: Tensor, levels: HashLevels, weights: Sequence[Tensor], offset: float, precision: torch.dtype, gradient: GradientBuffer
 ) -> Tensor:
-    """As `encode`: the gradients of the weights are autograd's, that of the table is added to the buffer."""
+    """The gradients of the weights are autograd's; that of the table is added to the buffer `gradient`."""
     return _HashNetwork.apply(points, table, levels, offset, precision, gradient, *weights)
 
 
@@ -173,10 +141,12 @@ class _HashNetwork(torch.autograd.Function):
     def forward(
         ctx: Any, points: Tensor, table: Tensor, levels: HashLevels, offset: float, precision: torch.dtype, gradient: GradientBuffer, *weights: Tensor
     ) -> Tensor:
-        at, features = _encoded(points, table, levels)
+        at, features = np.empty((3, len(points)), np.float32), np.empty((table.shape[1] * len(levels.sides), len(points)), np.float32)
+        hash_grid.transpose_points(_array(points), at)
+        hash_grid.encode(at, table.detach().numpy(), *levels, features)
         prepared = mlp.pack_weights([weight.detach().numpy() for weight in weights], bfloat16=precision == torch.bfloat16)
         out = torch.empty(len(points), len(weights[-1]))
-        kept = mlp.forward(features.numpy(), prepared, offset, out.numpy(), keep=any(ctx.needs_input_grad))
+        kept = mlp.forward(features, prepared, offset, out.numpy(), keep=any(ctx.needs_input_grad))
         if any(ctx.needs_input_grad):
             ctx.at, ctx.features, ctx.kept, ctx.prepared = at, features, kept, prepared
             ctx.table, ctx.levels, ctx.gradient = table, levels, gradient
@@ -185,9 +155,9 @@ class _HashNetwork(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        of_features, of_weights = mlp.backward(grad.contiguous().numpy(), ctx.features.numpy(), ctx.prepared, ctx.kept, ctx.shapes)
-        ctx.kept = None
-        _add_table_gradient(ctx.at, torch.from_numpy(of_features), ctx.table, ctx.levels, ctx.gradient)
+        of_features, of_weights = mlp.backward(grad.contiguous().numpy(), ctx.features, ctx.prepared, ctx.kept, ctx.shapes)
+        ctx.kept, levels = None, cast(HashLevels, ctx.levels)
+        hash_grid.encode_backward(ctx.at, of_features, *levels, ctx.gradient.accumulator(ctx.table).numpy())
         return None, None, None, None, None, None, *map(torch.from_numpy, of_weights)
 
 

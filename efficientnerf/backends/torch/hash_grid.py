@@ -22,11 +22,8 @@ class HashLevels(NamedTuple):
     mask: np.uint32  # entries of a hashed level, less one: all bits set
 
 
-def encode(points: Tensor, table: Tensor, levels: HashLevels, gradient: GradientBuffer | None = None) -> Tensor:
-    """Features (N, F L) at points (N, 3) in [0, 1]^3 from a table (entries, F); differentiable in both.
-
-    gradient  where numba's kernel adds the table's gradient; unused here
-    """
+def encode(points: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
+    """Features (N, F L) at points (N, 3) in [0, 1]^3 from a table (entries, F); differentiable in both."""
     columns = []
     corner = torch.stack(torch.meshgrid(*[torch.arange(2, device=points.device)] * 3, indexing="ij"), dim=-1).reshape(8, 3)
     for side, dense, start in zip(levels.sides.tolist(), levels.dense.tolist(), levels.starts.tolist(), strict=True):
@@ -56,5 +53,8 @@ def relu_network(features: Tensor, weights: Sequence[Tensor], offset: float, pre
 def hash_network(
     points: Tensor, table: Tensor, levels: HashLevels, weights: Sequence[Tensor], offset: float, precision: torch.dtype, gradient: GradientBuffer | None = None
 ) -> Tensor:
-    """`relu_network` of `encode`."""
-    return relu_network(encode(points, table, levels, gradient), weights, offset, precision)
+    """`relu_network` of `encode`.
+
+    gradient  where numba's kernel adds the table's gradient; unused here
+    """
+    return relu_network(encode(points, table, levels), weights, offset, precision)

@@ -118,7 +118,7 @@ class _Encode(torch.autograd.Function):
         return None, table_grad, None
 
 
-def encode(points: Tensor, table: Tensor, levels: HashLevels, gradient: GradientBuffer | None = None) -> Tensor:
+def encode(points: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
     """`efficientnerf.backends.torch.hash_grid.encode` with two features an entry; differentiable in the table."""
     return _Encode.apply(points, table, levels)
 

@@ -137,29 +137,14 @@ def composite_case(activation: str, degree: int) -> Case:
 LEVELS = HashLevels(np.array([4, 5, 16]), np.array([True, True, False]), np.array([0, 64, 189]), np.uint32(255))
 
 
-def grid_inputs() -> dict[str, Tensor]:
-    """Points in the cube, on its faces and corners, more than a vector's lanes; no multiple of them."""
-    generator = torch.Generator().manual_seed(1)
+def hash_network_case(layers: int) -> Case:
+    """Points in the cube, on its faces and corners, more than a vector's lanes and no multiple of them. Weights that are the field's shapes; a ReLU may change
+    sides where its argument is next to nothing, so gradients are compared less closely."""
+    generator, rng = torch.Generator().manual_seed(1), np.random.default_rng(3)
     points = torch.rand(37, 3, generator=generator)
     points[::7] = points[::7].round()
-    return {"points": points, "table": torch.randn(189 + 256, 2, generator=generator)}
-
-
-def features_of(points: np.ndarray, table: np.ndarray) -> np.ndarray:
+    inputs = {"points": points, "table": torch.randn(189 + 256, 2, generator=generator)}
     levels = (LEVELS.sides.tolist(), LEVELS.dense.tolist(), LEVELS.starts.tolist(), 256)
-    return np.array([reference.encode(p, table, *levels) for p in points.tolist()])
-
-
-def encode_case() -> Case:
-    def call(encode: Operation, points: Tensor, table: Tensor) -> list[Tensor]:
-        return [encode(points, table, LEVELS, buffer_for(table))]
-
-    return Case(call, lambda points, table: [features_of(points, table)], grid_inputs(), ("table",), atol=2e-5)
-
-
-def hash_network_case(layers: int) -> Case:
-    """Weights that are the field's shapes; a ReLU may change sides where its argument is next to nothing, so gradients are compared less closely."""
-    rng = np.random.default_rng(3)
     shapes = [(16, 6), *[(16, 16)] * (layers - 1), (13, 16)]
     weights = {f"weight{n}": torch.from_numpy((rng.normal(size=shape) * np.sqrt(2 / shape[1])).astype(np.float32)) for n, shape in enumerate(shapes)}
 
@@ -167,9 +152,10 @@ def hash_network_case(layers: int) -> Case:
         return [hash_network(points, table, LEVELS, list(weights.values()), 0.7, torch.float32, buffer_for(table))]
 
     def loop(points: np.ndarray, table: np.ndarray, **weights: np.ndarray) -> list[np.ndarray]:
-        return [np.array([reference.relu_network(f, list(weights.values()), 0.7) for f in features_of(points, table).tolist()])]
+        features = (reference.encode(p, table, *levels) for p in points.tolist())
+        return [np.array([reference.relu_network(f, list(weights.values()), 0.7) for f in features])]
 
-    return Case(call, loop, {**grid_inputs(), **weights}, ("table", *weights), atol=1e-4, rtol=1e-3)
+    return Case(call, loop, {**inputs, **weights}, ("table", *weights), atol=1e-4, rtol=1e-3)
 
 
 def adam_case(skip_zeros: bool) -> Case:
@@ -453,7 +439,6 @@ CASES: dict[str, dict[str, Callable[[], Case]]] = {
     "scaled_by_distance": {"": scaled_by_distance_case},
     "basis": {f"{degree}": lambda degree=degree: basis_case(degree) for degree in range(5)},  # type: ignore[misc]
     "sparse_depth_errors": {"": sparse_depth_errors_case},
-    "encode": {"": encode_case},
     "hash_network": {f"{n}": lambda n=n: hash_network_case(n) for n in (1, 2)},  # type: ignore[misc]
     "update_occupancy_maximum": {a: lambda a=a: update_occupancy_case(a) for a in ("exp", "softplus")}  # type: ignore[misc]
     | {"known": lambda: update_occupancy_case("exp", known=True)},
