@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from efficientnerf.backends.numba.mesh.photographs import blend, mark_edges, observe, sweep_down, sweep_up
+from efficientnerf.backends.numba.mesh.photographs import blend, mark_edges, observe, sweep_down
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera, project, resized
 from efficientnerf.surface.mesh import Mesh, face_areas
@@ -211,12 +211,10 @@ def edge_distance(usable: np.ndarray, near: np.ndarray, tick: Callable[[], None]
     for part in pieces(rows, first=64):
         tick()
         mark_edges(near, JUMP, part.start, part.stop, clear)
-    for part in pieces(rows, first=64):
-        tick()
-        sweep_down(part.start, part.stop, clear)
-    for part in pieces(rows, first=64):
-        tick()
-        sweep_up(rows - part.stop, rows - part.start, clear)
+    for image in (clear, clear[::-1, ::-1]):
+        for part in pieces(rows, first=64):
+            tick()
+            sweep_down(part.start, part.stop, image)
     return clear
 
 

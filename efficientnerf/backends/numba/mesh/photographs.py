@@ -18,25 +18,19 @@ def mark_edges(near, jump, begin, end, out):
     for row in range(begin, end):
         for column in range(width):
             here = near[row, column]
-            if column + 1 < width:
-                other = near[row, column + 1]
-                left = near[row, column - 1] if column > 0 else here
-                right = near[row, column + 2] if column + 2 < width else other
-                if _jumps(left, here, other, right, jump):
-                    out[row, column] = 0.0
-                    out[row, column + 1] = 0.0
-            if row + 1 < height:
-                other = near[row + 1, column]
-                left = near[row - 1, column] if row > 0 else here
-                right = near[row + 2, column] if row + 2 < height else other
-                if _jumps(left, here, other, right, jump):
-                    out[row, column] = 0.0
-                    out[row + 1, column] = 0.0
+            for down, across in ((0, 1), (1, 0)):
+                if row + down < height and column + across < width:
+                    other = near[row + down, column + across]
+                    left = near[row - down, column - across] if row >= down and column >= across else here
+                    right = near[row + 2 * down, column + 2 * across] if row + 2 * down < height and column + 2 * across < width else other
+                    if _jumps(left, here, other, right, jump):
+                        out[row, column] = out[row + down, column + across] = 0.0
 
 
 @numba.njit(cache=True, error_model="numpy")
 def sweep_down(begin, end, out):
-    """Half of a chamfer distance with steps of 1 and 1.4, from the zeros of `out` (H, W) float32: the rows `begin` to `end`, after all before them."""
+    """Half of a chamfer distance with steps of 1 and 1.4, from the zeros of `out` (H, W) float32: the rows `begin` to `end`, after all before them. The other
+    half is that of the image turned by 180 degrees."""
     width = out.shape[1]
     for row in range(begin, end):
         for column in range(width):
@@ -49,24 +43,6 @@ def sweep_down(begin, end, out):
                     found = min(found, out[row - 1, column - 1] + np.float32(1.4))
                 if column + 1 < width:
                     found = min(found, out[row - 1, column + 1] + np.float32(1.4))
-            out[row, column] = found
-
-
-@numba.njit(cache=True, error_model="numpy")
-def sweep_up(begin, end, out):
-    """The other half: the rows `begin` to `end`, after all behind them, from the last one on."""
-    height, width = out.shape
-    for row in range(end - 1, begin - 1, -1):
-        for column in range(width - 1, -1, -1):
-            found = out[row, column]
-            if column + 1 < width:
-                found = min(found, out[row, column + 1] + np.float32(1.0))
-            if row + 1 < height:
-                found = min(found, out[row + 1, column] + np.float32(1.0))
-                if column + 1 < width:
-                    found = min(found, out[row + 1, column + 1] + np.float32(1.4))
-                if column > 0:
-                    found = min(found, out[row + 1, column - 1] + np.float32(1.4))
             out[row, column] = found
 
 
