@@ -11,14 +11,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from efficientnerf.backends.layout import RayBundle, SampleColumns
-from efficientnerf.backends.numba import intervals
-from efficientnerf.backends.numba.intervals import LANES
 from efficientnerf.backends.numba.runtime import PRANGE, numba
-from efficientnerf.backends.numba.vector.maths import lowest_bit
-from efficientnerf.backends.numba.vector.memory import pointer
+from efficientnerf.backends.numba.vector.maths import absolute, bits_of, broadcast, lowest_bit, maximum, minimum, select, to_int32
+from efficientnerf.backends.numba.vector.memory import gather, load, pointer, store
 from efficientnerf.geometry.spaces import FARTHEST
 
 BLOCK = 64  # rays per task
+LANES = 16  # rays that are marched at once
+# Rows of the state, (ROWS, LANES) float32: origin and direction in unit coordinates; distance along the ray, and where the ray leaves the space; offset of a
+# sample in its interval; threshold of the density voxels; number of intervals visited; start of the last of them.
+UX, UY, UZ, VX, VY, VZ, T, T_EXIT, OFFSET, THRESHOLD, VISITED, START, ROWS = range(13)
+_NONE, _QUARTER, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.25), np.float32(0.5), np.float32(1), np.float32(2)
 
 
 class Box(NamedTuple):
@@ -42,8 +45,60 @@ def _unit_to_grid(x, y, z, contracted):
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
+def _row(state, n):
+    return load(state, n * LANES, LANES)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _point_at(state, t):
+    """Points at distances along the rays, unit coordinates."""
+    return _row(state, UX) + t * _row(state, VX), _row(state, UY) + t * _row(state, VY), _row(state, UZ) + t * _row(state, VZ)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _norm(x, y, z):
+    """Maximum norm, at least 1."""
+    return maximum(maximum(absolute(x), absolute(y)), maximum(absolute(z), _ONE))
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _along(x, side):
+    """Number of the voxel at a grid coordinate along an axis; 0 for NaN."""
+    return to_int32(minimum(maximum(x * np.float32(side), _NONE), np.float32(side - 1)))
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _next_intervals(state, voxels, side, step, farthest, contracted):
+    """Advance each ray by one interval: bit n of the result is set where ray n had not left the space, bit LANES + n where the interval is valid.
+
+    state, voxels  pointers to the rows above and to (side, side, side) float32
+    contracted     a literal. In the box an interval is `step` long, and a ray ends at T_EXIT; in contracted space it grows beyond the box with the square of
+                   the norm, and a ray ends where 1 / norm is below `farthest`, too
+    """
+    t, visited = _row(state, T), _row(state, VISITED)
+    active, length = t < _row(state, T_EXIT), broadcast(step, LANES)
+    if contracted:
+        x, y, z = _point_at(state, t)
+        norm = _norm(x, y, z)
+        active, length = active & (norm * farthest <= _ONE), length * (norm * norm)
+    x, y, z = _point_at(state, t + _row(state, OFFSET) * minimum(length, _row(state, T_EXIT) - t))
+    shift, scale = _ONE, _HALF
+    if contracted:
+        norm = _norm(x, y, z)
+        factor = (_TWO - _ONE / norm) / norm
+        x, y, z = x * factor, y * factor, z * factor
+        shift, scale = _TWO, _QUARTER
+    i, j, k = _along((x + shift) * scale, side), _along((y + shift) * scale, side), _along((z + shift) * scale, side)
+    valid = active & (gather(voxels, (i * side + j) * side + k) > _row(state, THRESHOLD))
+    store(state, START * LANES, t)
+    store(state, T * LANES, select(active, t + length, t))
+    store(state, VISITED * LANES, select(active, visited + _ONE, visited))
+    return bits_of(active) | bits_of(valid) << LANES
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _init_lane(origins, directions, near, far, centre, half, contracted, r, state, lane):
-    """Write ray r, clipped to the box of a bounded space, to a lane of the state of `next_intervals`."""
+    """Write ray r, clipped to the box of a bounded space, to a lane of the state of `_next_intervals`."""
     ux, uy, uz = (origins[r, 0] - centre[0]) / half[0], (origins[r, 1] - centre[1]) / half[1], (origins[r, 2] - centre[2]) / half[2]
     vx, vy, vz = directions[r, 0] / half[0], directions[r, 1] / half[1], directions[r, 2] / half[2]
     tiny = np.float32(1e-12)
@@ -58,9 +113,9 @@ def _init_lane(origins, directions, near, far, centre, half, contracted, r, stat
         az, bz = (-one - uz) / sz, (one - uz) / sz
         t = max(max(min(ax, bx), min(ay, by)), max(min(az, bz), near[r]))
         t_exit = min(min(max(ax, bx), max(ay, by)), min(max(az, bz), far[r]))
-    state[intervals.UX, lane], state[intervals.UY, lane], state[intervals.UZ, lane] = ux, uy, uz
-    state[intervals.VX, lane], state[intervals.VY, lane], state[intervals.VZ, lane] = vx, vy, vz
-    state[intervals.T, lane], state[intervals.T_EXIT, lane] = t, t_exit
+    state[UX, lane], state[UY, lane], state[UZ, lane] = ux, uy, uz
+    state[VX, lane], state[VY, lane], state[VZ, lane] = vx, vy, vz
+    state[T, lane], state[T_EXIT, lane] = t, t_exit
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
@@ -70,16 +125,16 @@ def _find_valid(rays, box, step, max_intervals, voxels, threshold, unpruned, cou
     farthest, never, side, grid = np.float32(FARTHEST), np.float32(-np.inf), voxels.shape[0], pointer(voxels)
     for block in numba.prange((len(origins) + LANES - 1) // LANES):
         begin, end = block * LANES, min(len(origins), (block + 1) * LANES)
-        state = np.zeros((intervals.ROWS, LANES), np.float32)  # a lane without a ray is past its exit
+        state = np.zeros((ROWS, LANES), np.float32)  # a lane without a ray is past its exit
         for r in range(begin, end):
             _init_lane(origins, directions, near, far, centre, half, contracted, r, state, r - begin)
-            state[intervals.OFFSET, r - begin], state[intervals.THRESHOLD, r - begin] = offset[r], never if r < unpruned else threshold
+            state[OFFSET, r - begin], state[THRESHOLD, r - begin] = offset[r], never if r < unpruned else threshold
         p_state = pointer(state)
         for _ in range(max_intervals):
             if contracted:
-                masks = intervals.next_intervals(p_state, grid, side, step, farthest, True)
+                masks = _next_intervals(p_state, grid, side, step, farthest, True)
             else:
-                masks = intervals.next_intervals(p_state, grid, side, step, farthest, False)
+                masks = _next_intervals(p_state, grid, side, step, farthest, False)
             if masks == 0:
                 break
             valid = masks >> LANES
@@ -87,10 +142,10 @@ def _find_valid(rays, box, step, max_intervals, voxels, threshold, unpruned, cou
                 lane = lowest_bit(valid)
                 valid &= valid - 1
                 r = begin + lane
-                starts[r, counts[r]] = state[intervals.START, lane]
+                starts[r, counts[r]] = state[START, lane]
                 counts[r] += 1
         for r in range(begin, end):
-            visited[r], t_exit[r] = np.int64(state[intervals.VISITED, r - begin]), state[intervals.T_EXIT, r - begin]
+            visited[r], t_exit[r] = np.int64(state[VISITED, r - begin]), state[T_EXIT, r - begin]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
