@@ -17,54 +17,19 @@ def harmonic(direction, TERM: tl.constexpr):
     xx, yy, zz = x * x, y * y, z * z
     if TERM == 0:
         value = 0.0 * x + 1.0
-    elif TERM == 1:
-        value = y
-    elif TERM == 2:
-        value = z
-    elif TERM == 3:
-        value = x
-    elif TERM == 4:
-        value = x * y
-    elif TERM == 5:
-        value = y * z
-    elif TERM == 6:
-        value = 2 * zz - xx - yy
-    elif TERM == 7:
-        value = x * z
-    elif TERM == 8:
-        value = xx - yy
-    elif TERM == 9:
-        value = y * (3 * xx - yy)
-    elif TERM == 10:
-        value = x * y * z
-    elif TERM == 11:
-        value = y * (4 * zz - xx - yy)
-    elif TERM == 12:
-        value = z * (2 * zz - 3 * xx - 3 * yy)
-    elif TERM == 13:
-        value = x * (4 * zz - xx - yy)
-    elif TERM == 14:
-        value = z * (xx - yy)
-    elif TERM == 15:
-        value = x * (xx - 3 * yy)
-    elif TERM == 16:
-        value = x * y * (xx - yy)
-    elif TERM == 17:
-        value = y * z * (3 * xx - yy)
-    elif TERM == 18:
-        value = x * y * (7 * zz - 1)
-    elif TERM == 19:
-        value = y * z * (7 * zz - 3)
-    elif TERM == 20:
-        value = zz * (35 * zz - 30) + 3
-    elif TERM == 21:
-        value = x * z * (7 * zz - 3)
-    elif TERM == 22:
-        value = (xx - yy) * (7 * zz - 1)
-    elif TERM == 23:
-        value = x * z * (xx - 3 * yy)
+    elif TERM < 4:
+        value = (y, z, x)[TERM - 1]
+    elif TERM < 9:
+        value = (x * y, y * z, 2 * zz - xx - yy, x * z, xx - yy)[TERM - 4]
+    elif TERM < 16:
+        value = (
+            y * (3 * xx - yy), x * y * z, y * (4 * zz - xx - yy), z * (2 * zz - 3 * xx - 3 * yy), x * (4 * zz - xx - yy), z * (xx - yy), x * (xx - 3 * yy),
+        )[TERM - 9]  # fmt: skip
     else:
-        value = xx * (xx - 3 * yy) - yy * (3 * xx - yy)
+        value = (
+            x * y * (xx - yy), y * z * (3 * xx - yy), x * y * (7 * zz - 1), y * z * (7 * zz - 3), zz * (35 * zz - 30) + 3, x * z * (7 * zz - 3),
+            (xx - yy) * (7 * zz - 1), x * z * (xx - 3 * yy), xx * (xx - 3 * yy) - yy * (3 * xx - yy),
+        )[TERM - 16]  # fmt: skip
     return value * FACTORS[TERM]
 
 

@@ -22,8 +22,8 @@ from efficientnerf.asset.cascades import brick_ranges, cascades_of
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.transfer import constant, to_device
 from efficientnerf.backends.triton.launch import INTERPRETED
-from efficientnerf.backends.triton.tree_march import Cascades, Rays
-from efficientnerf.backends.triton.tree_rendering import DeviceCamera, Voxels, render
+from efficientnerf.backends.triton.tree_march import Cascades, Rays, Voxels
+from efficientnerf.backends.triton.tree_rendering import DeviceCamera, render
 from efficientnerf.backends.triton.vectors import Vec3
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.rendering import environment
@@ -147,7 +147,7 @@ def _launch(
     # Without voxels there is nothing that the kernel would read, but it must have something to point at.
     density, index, sh = (x if len(x) else x.new_zeros(1, x.shape[1]) for x in (t.density, t.index, t.sh))
     render[(programs,)](
-        rays or Rays(*[out.colour] * 3), t.cascades, Voxels(density, index, sh, float(t.voxel)), out, count, *size, camera,
+        rays or Rays(*[out.colour] * 3), t.cascades, Voxels(index, density, sh, float(t.voxel)), out, count, *size, camera,
         Vec3(*(float(x) for x in background or (0, 0, 0))),
         PINHOLE=rays is None, OVER=background is not None, NEAREST=t.nearest, CASCADES=len(t.cascades.first), BRICK=t.brick, K=t.terms,
         ROW=t.sh.shape[1], WIDE=wide, HIGH=high, num_warps=WARPS[t.sh.shape[1]] * min(2, len(t.cascades.first)),

@@ -28,7 +28,17 @@ from efficientnerf.backends.structure import structure_change
 from efficientnerf.backends.triton.harmonics import basis_columns
 from efficientnerf.backends.triton.launch import INTERPRETED, blocks
 from efficientnerf.backends.triton.tree import brick_arrays, device_cascades
-from efficientnerf.backends.triton.tree_march import Cascades, Rays, colour_of, corner_place, corner_weight, interpolate_harmonics, march_cascades
+from efficientnerf.backends.triton.tree_march import (
+    Cascades,
+    Rays,
+    Scene,
+    Voxels,
+    colour_of,
+    corner_place,
+    corner_weight,
+    interpolate_harmonics,
+    march_cascades,
+)
 from efficientnerf.backends.triton.vectors import Vec3, add_scaled, load_vec3, store_vec3, zeros_vec3
 
 # Rays and warps of a program by the length of a row of coefficients: so few that what a sample needs stays in registers. Rays of a bundle come from
@@ -69,26 +79,6 @@ def device_grid(tree: NerfTree, device: str | torch.device) -> DeviceGrid:
         index = index.new_full((1, index.shape[1]), -1)  # nothing is read, but kernels need a pointer
     cascade_of = torch.from_numpy(voxel_cascades(tree) if tree.outer else np.zeros(1, np.uint8)).to(device)
     return DeviceGrid(device_cascades(tree, owner), index, tree.brick, tree.harmonics_count, tree.voxel, tree.lookup == "nearest", cascade_of)
-
-
-class Voxels(NamedTuple):
-    """index of `DeviceGrid`; density (N,) and sh (N, 3 K); voxel: side of cascade 0's voxels."""
-
-    index: Any
-    density: Any
-    sh: Any
-    voxel: Any
-
-
-class Scene(NamedTuple):
-    """Voxels; basis (R, C) harmonics of the columns; column (C,)."""
-
-    index: Any
-    density: Any
-    sh: Any
-    voxel: Any
-    basis: Any
-    column: Any
 
 
 class Sums(NamedTuple):
@@ -141,11 +131,12 @@ def _thickness(index, density, sample, voxel, BRICK: tl.constexpr, NEAREST: tl.c
 @triton.jit
 def _shaded(scene, sample, transmittance, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr):
     """Of samples: whether they show, weight where they do, colour (Vec3), transmittance behind them, and the sum of the corners' weights."""
-    thickness = _thickness(scene.index, scene.density, sample, scene.voxel, BRICK, NEAREST)
+    voxels = scene.voxels
+    thickness = _thickness(voxels.index, voxels.density, sample, voxels.voxel, BRICK, NEAREST)
     after = transmittance * tl.exp(-thickness)
     weight = transmittance - after
     visible = thickness > 0
-    mixed, total = interpolate_harmonics(scene.index, scene.sh, sample, visible, scene.column, 3 * K, BRICK, NEAREST)
+    mixed, total = interpolate_harmonics(voxels.index, voxels.sh, sample, visible, scene.column, 3 * K, BRICK, NEAREST)
     return visible, weight * visible.to(tl.float32), colour_of(mixed, total, scene.basis, scene.column % 3), after, total
 
 
@@ -171,7 +162,7 @@ def _forward(
 ):  # fmt: skip
     """Premultiplied colour (R, 3) and final transmittance (R,) of rays."""
     r, live, origin, direction, basis = _rays(rays, count, K, ROW, BLOCK)
-    scene = Scene(voxels.index, voxels.density, voxels.sh, voxels.voxel, basis, tl.arange(0, ROW))
+    scene = Scene(voxels, basis, tl.arange(0, ROW))
     start = Forward(tl.full((BLOCK,), 1.0, tl.float32), zeros_vec3(BLOCK))
     end = march_cascades(cascades, origin, direction, live, scene, start, _composite, CASCADES, BRICK, NEAREST, K, ROW)
     store_vec3(colour, r, end.colour, live)
@@ -197,7 +188,7 @@ def _add_gradients(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.conste
     by_logit = tl.where((channel == 0)[None, :], by_rgb.x[:, None], tl.where((channel == 1)[None, :], by_rgb.y[:, None], by_rgb.z[:, None]))
     by_column = scene.basis * by_logit / total[:, None]
     for n in tl.static_range(1 if NEAREST else 8):
-        voxel = tl.load(scene.index + corner_place(sample.corner, n, BRICK), visible, other=-1).to(tl.int64)
+        voxel = tl.load(scene.voxels.index + corner_place(sample.corner, n, BRICK), visible, other=-1).to(tl.int64)
         stored = voxel >= 0
         scaled = tl.where(stored, corner_weight(sample.fraction, n), 0.0) * sums.scale  # by the sum of the stored ones, the others' may be beyond any integer
         tl.store(sums.stamp + voxel, sums.number, stored)
@@ -219,7 +210,7 @@ def _backward(
     sums       by optical thickness, and by harmonics
     """
     r, live, origin, direction, basis = _rays(rays, count, K, ROW, BLOCK)
-    scene = Scene(voxels.index, voxels.density, voxels.sh, voxels.voxel, basis, tl.arange(0, ROW))
+    scene = Scene(voxels, basis, tl.arange(0, ROW))
     behind = load_vec3(outputs[0], r, live)
     by_colour = load_vec3(gradients[0], r, live)
     by_end = tl.load(outputs[1] + r, live, other=1.0) * tl.load(gradients[1] + r, live, other=0.0)
@@ -230,7 +221,7 @@ def _backward(
 
 @triton.jit
 def _raise_maximum(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr):
-    """given  index, density, voxel as in a Scene; transmittance at which rays reach the grid; the buffer that is raised (N,)"""
+    """given  index, density, voxel as in Voxels; transmittance at which rays reach the grid; the buffer that is raised (N,)"""
     index, density, voxel, arriving, maximum = given[0], given[1], given[2], given[3], given[4]
     after = state.transmittance * tl.exp(-_thickness(index, density, sample, voxel, BRICK, NEAREST))
     weight = arriving * (state.transmittance - after)

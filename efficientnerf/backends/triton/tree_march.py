@@ -50,6 +50,23 @@ class Rays(NamedTuple):
     views: Any
 
 
+class Voxels(NamedTuple):
+    """Where voxels lie, their densities and harmonics, and the side of cascade 0's in the frame."""
+
+    index: Any
+    density: Any
+    sh: Any
+    voxel: Any
+
+
+class Scene(NamedTuple):
+    """Voxels; basis (R, C) harmonics of the columns of a row of coefficients; column (C,)."""
+
+    voxels: Any
+    basis: Any
+    column: Any
+
+
 class Ray(NamedTuple):
     """origin, direction (unit), inverse (1 / direction) Vec3; enter, leave: distances between which it is in the grid, enter >= 0."""
 

@@ -14,6 +14,7 @@ import triton.language as tl
 from efficientnerf.backends.triton.harmonics import basis_columns
 from efficientnerf.backends.triton.tree_march import (
     Grid,
+    Scene,
     cascade_grid,
     colour_of,
     density_at,
@@ -38,26 +39,6 @@ class DeviceCamera(NamedTuple):
     focal_y: Any
     principal_x: Any
     principal_y: Any
-
-
-class Voxels(NamedTuple):
-    """density, index, sh of `DeviceTree`; voxel: side of cascade 0's voxels in the frame."""
-
-    density: Any
-    index: Any
-    sh: Any
-    voxel: Any
-
-
-class Scene(NamedTuple):
-    """Voxels; basis (R, C) harmonics of the columns; column (C,)."""
-
-    density: Any
-    index: Any
-    sh: Any
-    voxel: Any
-    basis: Any
-    column: Any
 
 
 class State(NamedTuple):
@@ -89,19 +70,20 @@ def _pixel_rays(camera, width, height, WIDE: tl.constexpr, HIGH: tl.constexpr):
 @triton.jit
 def _composite(scene, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr):
     """Add a sample to the State of its rays."""
-    sigma = interpolate_density(scene.density, sample.corner, sample.fraction, sample.inside, BRICK, NEAREST)
-    alpha = 1 - tl.exp(-sigma * (sample.step * scene.voxel * sample.unit))
+    voxels = scene.voxels
+    sigma = interpolate_density(voxels.density, sample.corner, sample.fraction, sample.inside, BRICK, NEAREST)
+    alpha = 1 - tl.exp(-sigma * (sample.step * voxels.voxel * sample.unit))
     pending = state.pending_weight + state.transmittance * alpha
     visible = sample.inside & (pending > MIN_WEIGHT) & (sigma > 0)
     colour = state.colour
     if tl.max(visible.to(tl.int32), 0) > 0:
-        mixed, total = interpolate_harmonics(scene.index, scene.sh, sample, visible, scene.column, COLUMNS, BRICK, NEAREST)
+        mixed, total = interpolate_harmonics(voxels.index, voxels.sh, sample, visible, scene.column, COLUMNS, BRICK, NEAREST)
         rgb = colour_of(mixed, total, scene.basis, scene.column // K)
         colour = add_scaled(colour, tl.where(visible, pending, 0.0), rgb)
         pending = tl.where(visible, 0.0, pending)
     after = state.transmittance * (1 - alpha)
     crossing = sample.inside & (state.transmittance > 0.5) & (after <= 0.5)
-    at_half = (sample.distance - 0.5 * sample.step) * sample.unit + tl.log(2 * tl.maximum(state.transmittance, 0.5)) / (tl.maximum(sigma, 1e-20) * scene.voxel)
+    at_half = (sample.distance - 0.5 * sample.step) * sample.unit + tl.log(2 * tl.maximum(state.transmittance, 0.5)) / (tl.maximum(sigma, 1e-20) * voxels.voxel)
     return State(after, pending, colour, tl.where(crossing, at_half, state.depth))
 
 
@@ -159,7 +141,7 @@ def render(
         cosine = tl.full((BLOCK,), 1.0, tl.float32)
         basis = basis_columns(load_vec3(rays.views, r, live), column % K, K)
     start = State(tl.full((BLOCK,), 1.0, tl.float32), tl.zeros((BLOCK,), tl.float32), zeros_vec3(BLOCK), tl.full((BLOCK,), float("inf"), tl.float32))
-    scene = Scene(voxels.density, voxels.index, voxels.sh, voxels.voxel, basis, column)
+    scene = Scene(voxels, basis, column)
     end = march_cascades(cascades, origin, direction, live, scene, start, _composite, CASCADES, BRICK, NEAREST, K, ROW)
 
     opaque = live & (end.transmittance <= 0.5)
