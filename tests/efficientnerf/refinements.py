@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from efficientnerf.asset.cascades import voxel_sides
+from efficientnerf.asset.cascades import voxel_cascades, voxel_coordinates, voxel_sides
 from efficientnerf.asset.refinement.host import in_voxels, packet_bases
 from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.tree import NerfTree
@@ -120,6 +120,14 @@ def records_of(tree: NerfTree, state: RefinementState, seed: int, packet: int = 
     cells, basis = cells_of(tree), packet_bases(bases, first)
     values = values_of(cells, state.density, state.sh)
     return kernels.forward_backward(cells, first, start, along, basis, values.dense, values.sh, seen, RecordBuffer(), stop=EARLY_STOP)[1]
+
+
+def neighbours_by_place(tree: NerfTree) -> np.ndarray:
+    """(N, 6) the voxels of the same cascade beyond the faces -x, x, -y, y, -z, z of each, -1 where none is stored."""
+    at = np.concatenate([voxel_coordinates(tree), voxel_cascades(tree)[:, None]], axis=1)
+    number = {tuple(place): n for n, place in enumerate(at.tolist())}
+    steps = [way * np.eye(4, dtype=int)[axis] for axis in range(3) for way in (-1, 1)]
+    return np.array([[number.get(tuple((place + step).tolist()), -1) for step in steps] for place in at])
 
 
 def moments_of(state: RefinementState) -> Moments:

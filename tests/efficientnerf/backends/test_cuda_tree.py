@@ -12,7 +12,7 @@ from efficientnerf.geometry.cameras import Camera
 from efficientnerf.rendering import environment
 from tests.efficientnerf.device import DEVICE
 from tests.efficientnerf.tree_reference import render_reference
-from tests.efficientnerf.trees import LOW, looking, nested_rays, random_cascades, random_tree, rays_at, tensors
+from tests.efficientnerf.trees import LOW, in_codes, looking, nested_rays, random_cascades, random_tree, rays_at, tensors
 
 cuda = pytest.importorskip("efficientnerf.backends.triton.tree")
 
@@ -53,9 +53,8 @@ def test_rays_are_those_of_the_torch_function(brick: int, degree: int, step_size
     agree(found, render_rays(tree, origins, directions))
 
 
-@pytest.mark.parametrize("share", [0.1])
-def test_skipping_empty_space_changes_no_value(share: float) -> None:
-    tree = random_tree(7, shape=(7, 6, 8), brick=2, degree=2, share=share)
+def test_skipping_empty_space_changes_no_value() -> None:
+    tree = random_tree(7, shape=(7, 6, 8), brick=2, degree=2, share=0.1)
     origins, directions = rays_at(tree, 96)
     agree(device_rays(tree, origins, directions), render_rays(tree, origins, directions), faces=0.011)
 
@@ -102,18 +101,9 @@ def test_an_empty_tree_and_no_rays() -> None:
 
 
 def test_palettes_are_decoded() -> None:
-    from efficientnerf.asset.palettes import PaletteHarmonics
-
-    tree = random_tree(3, degree=1)
-    rng = np.random.default_rng(0)
-    count = len(tree.density_values)
-    codes = PaletteHarmonics(
-        rng.integers(0, 9, (count, 3), dtype=np.uint8), rng.normal(size=(9, 3)).astype(np.float32),
-        rng.integers(0, 7, (count, 2), dtype=np.uint8), rng.normal(size=(7, 3, 3)).astype(np.float32), (1, 2),
-    )  # fmt: skip
-    coded = replace(tree, harmonics=codes)
-    plain = replace(tree, harmonics=codes.decoded())
-    origins, directions = rays_at(tree, 40)
+    coded = in_codes(random_tree(3, degree=1), (1, 2), 7)
+    plain = replace(coded, harmonics=coded.harmonics.decoded())  # type: ignore[union-attr]
+    origins, directions = rays_at(coded, 40)
     by_codes, by_values = (device_rays(each, origins, directions) for each in (coded, plain))
     assert np.array_equal(by_codes.colour, by_values.colour)
     assert np.array_equal(by_codes.opacity, by_values.opacity)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset.cascades import cascade_grids, nested, voxel_cascades, voxel_coordinates
+from efficientnerf.asset.cascades import cascade_grids, nested, voxel_cascades
 from efficientnerf.asset.refinement.error_map import ErrorMap
 from efficientnerf.asset.refinement.fit import error, max_weights, optimise
 from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state
@@ -20,7 +20,7 @@ from efficientnerf.training.patches import PatchGrid
 from efficientnerf.training.pixels import Pixels
 from tests.efficientnerf.balls import BOUNDS, cameras, photograph, pixels
 from tests.efficientnerf.device import DEVICE
-from tests.efficientnerf.refinements import ball_tree, device_gradients, gradients_by_autograd, seen_at_random
+from tests.efficientnerf.refinements import ball_tree, device_gradients, gradients_by_autograd, neighbours_by_place, seen_at_random
 from tests.efficientnerf.trees import nested_rays, random_cascades, random_tree, rays_at, uniform_tree
 from tests.efficientnerf.walls import camera_at, wall
 
@@ -143,12 +143,7 @@ def test_steps_are_those_of_the_cpu(tree: NerfTree, total_variation: float) -> N
 
 @pytest.mark.parametrize("tree", [random_tree(2), random_tree(3, brick=1), nested_balls()], ids=["one", "bricks of one voxel", "cascades"])
 def test_voxels_beside_are_a_step_away(tree: NerfTree) -> None:
-    beside, at, cascades = device.voxels_beside(tree), voxel_coordinates(tree), voxel_cascades(tree)
-    place = {(int(of), *map(int, row)): n for n, (of, row) in enumerate(zip(cascades, at, strict=True))}
-    for face in range(6):
-        step = np.eye(3, dtype=int)[face // 2] * (1 if face % 2 else -1)
-        wanted = [place.get((int(of), *map(int, row + step)), -1) for of, row in zip(cascades, at, strict=True)]
-        np.testing.assert_array_equal(beside[:, face], wanted)
+    np.testing.assert_array_equal(device.voxels_beside(tree), neighbours_by_place(tree))
 
 
 def test_interrupted_or_not_the_bytes_are_the_same() -> None:
@@ -158,17 +153,16 @@ def test_interrupted_or_not_the_bytes_are_the_same() -> None:
         assert np.array_equal(getattr(whole, name), getattr(apart, name)), name
 
 
-@pytest.mark.parametrize("smooth", [True])
-def test_the_room_that_a_fit_takes_is_known_before(*, smooth: bool) -> None:
+def test_the_room_that_a_fit_takes_is_known_before() -> None:
     from stages.bake.memory import needed_on_device
 
     tree = random_tree(4, shape=(5, 5, 5), brick=4, degree=2, share=0.5)
     errors = ErrorMap(PatchGrid(pixels(2, 8), 4))
-    arrays = device.DeviceArrays(initial_state(tree), torch.device(DEVICE), errors, smooth=smooth)
+    arrays = device.DeviceArrays(initial_state(tree), torch.device(DEVICE), errors, smooth=True)
     tensors = [*arrays.values.values(), *arrays.neighbours, arrays.by_thickness, arrays.by_sh, arrays.stamp, arrays.grid.index, arrays.grid.cascades.owner]
     taken = sum(t.numel() * t.element_size() for t in tensors)
     # The grid is there once then; three times while it is sent.
-    needed = needed_on_device(len(tree.density_values), 9, len(tree.voxel_index), tree.brick_index.size, 4, smooth=smooth)
+    needed = needed_on_device(len(tree.density_values), 9, len(tree.voxel_index), tree.brick_index.size, 4, smooth=True)
     assert needed == taken + 8 * tree.brick_index.size
     nest = device.DeviceArrays(initial_state(random_cascades(4)), torch.device(DEVICE), errors).grid
     assert nest.cascades.owner.numel() == 3 * 4**3

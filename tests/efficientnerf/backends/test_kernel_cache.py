@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from efficientnerf.backends import kernel_cache
+from efficientnerf.backends.numba.runtime import KernelFiles
 
 PACKAGE = kernel_cache.ROOT / "efficientnerf"
 KEY = "0123456789abcdef"
@@ -209,8 +210,6 @@ def damaged(content: bytes) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
 def test_damaged_kernel_files_are_never_unpickled(tmp_path: Path, suffix: str) -> None:
-    from efficientnerf.backends.numba.runtime import KernelFiles
-
     files = KernelFiles(str(tmp_path), "kernel", "sources")
     files.save("signature", ["code"])
     assert files.load("signature") == ["code"]
@@ -228,8 +227,6 @@ def test_damaged_kernel_files_are_never_unpickled(tmp_path: Path, suffix: str) -
 
 def test_forms_that_are_compiled_at_the_same_moment_are_never_mixed_up(tmp_path: Path) -> None:
     """Whatever of its work one process has done when another does all of its own; numba's numbers mix them."""
-    from efficientnerf.backends.numba.runtime import KernelFiles
-
     for number, step in enumerate(("_load_index", "_save_index", "_save_data")):
         for after in (False, True):
             folder = tmp_path / f"{number} {after}"
@@ -254,8 +251,6 @@ def test_forms_that_are_compiled_at_the_same_moment_are_never_mixed_up(tmp_path:
 
 
 def test_a_process_that_is_killed_while_it_saves_leaves_no_other_forms_code(tmp_path: Path) -> None:
-    from efficientnerf.backends.numba.runtime import KernelFiles
-
     files = KernelFiles(str(tmp_path), "kernel", "sources")
     files.save("float32", ["code of float32"])
     next(tmp_path.glob("*.nbi")).unlink()
@@ -372,46 +367,39 @@ def test_a_folder_that_others_could_write_to_is_refused(tmp_path: Path) -> None:
     assert kernel_cache.first_private([shared], KEY)[0] is None
 
 
+def made(place: Path, days: float) -> Path:
+    """A folder of kernels that was not used for so many days."""
+    (place / "numba").mkdir(parents=True)
+    (place / "numba" / "code.nbc").touch()
+    os.utime(place, (time.time() - days * kernel_cache.DAY,) * 2)
+    return place
+
+
 def test_folders_out_of_use_are_removed_and_nothing_else(tmp_path: Path) -> None:
     root = tmp_path / "kernels"
     root.mkdir(mode=0o700)
-    now = kernel_cache.time.time()
-
-    def made(name: str, days: float) -> Path:
-        (root / name / "numba").mkdir(parents=True)
-        (root / name / "numba" / "code.nbc").touch()
-        os.utime(root / name, (now - days * kernel_cache.DAY,) * 2)
-        return root / name
-
-    recent = [made(f"{number:016x}", number / 100) for number in range(12)]
-    week = [made(f"a{number:015x}", 7) for number in range(3)]
-    old, own, foreign = made("b" * 16, 31), made(KEY, 100), made("notes", 100)
+    recent = [made(root / f"{number:016x}", number / 100) for number in range(12)]
+    week = [made(root / f"a{number:015x}", 7) for number in range(3)]
+    old, own, foreign = made(root / ("b" * 16), 31), made(root / KEY, 100), made(root / "notes", 100)
     assert kernel_cache.first_private([root], KEY) == (own, [])
     assert all(place.exists() for place in (*recent, own, foreign))
     assert not any(place.exists() for place in (*week, old))
-    assert now - own.stat().st_mtime < 60
+    assert time.time() - own.stat().st_mtime < 60
 
 
 def test_states_of_a_modules_sources_out_of_use_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The present one stays, however old, and so do those of other modules; of modules that are gone none is present."""
-    adam, gone = f"{kernel_cache.KERNELS}.adam", f"{kernel_cache.KERNELS}.gone"
-    now, root = time.time(), tmp_path / "cache" / "kernels" / kernel_cache.key()
-
-    def made(module: str, name: str, days: float) -> Path:
-        (root / module / name).mkdir(parents=True)
-        (root / module / name / "code.nbc").touch()
-        os.utime(root / module / name, (now - days * kernel_cache.DAY,) * 2)
-        return root / module / name
-
-    own, old, other = made(adam, KEY, 100), made(adam, "a" * 16, 31), made(f"{kernel_cache.KERNELS}.mlp", "b" * 16, 31)
-    week = [made(adam, f"c{number:015x}", 7 + number / 100) for number in range(kernel_cache.KEPT + 2)]
-    left, removed = made(gone, "d" * 16, 7), made(gone, "e" * 16, 31)
+    root = tmp_path / "cache" / "kernels" / kernel_cache.key()
+    adam, mlp, gone = (root / f"{kernel_cache.KERNELS}.{name}" for name in ("adam", "mlp", "gone"))
+    own, old, other = made(adam / KEY, 100), made(adam / ("a" * 16), 31), made(mlp / ("b" * 16), 31)
+    week = [made(adam / f"c{number:015x}", 7 + number / 100) for number in range(kernel_cache.KEPT + 2)]
+    left, removed = made(gone / ("d" * 16), 7), made(gone / ("e" * 16), 31)
     monkeypatch.setenv("ENERF_CACHE_DIR", str(tmp_path / "cache"))
     for each in (tmp_path / "cache", root.parent, root):
         each.chmod(0o700)
     for function in (kernel_cache.folder, kernel_cache.folder_of):
         monkeypatch.setattr(kernel_cache, function.__name__, function.__wrapped__)
-    assert kernel_cache.folder_of(adam, KEY) == own
+    assert kernel_cache.folder_of(adam.name, KEY) == own
     assert all(place.exists() for place in (own, other, left, *week[: kernel_cache.KEPT]))
     assert not any(place.exists() for place in (old, removed, *week[kernel_cache.KEPT :]))
-    assert now - own.stat().st_mtime < 60
+    assert time.time() - own.stat().st_mtime < 60

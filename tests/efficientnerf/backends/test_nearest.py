@@ -14,10 +14,10 @@ from efficientnerf.asset.queries import colour_at, density_at
 from efficientnerf.asset.refinement.state import initial_state
 from efficientnerf.asset.rendering import render, render_rays
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.geometry.cameras import rays
 from efficientnerf.rendering.harmonics import basis_numpy
 from tests import reference
 from tests.efficientnerf.nerftree_reader import Tree
-from tests.efficientnerf.refinements import gradients, gradients_by_autograd, seen_at_random
 from tests.efficientnerf.tree_reference import render_reference
 from tests.efficientnerf.trees import TREES, random_tree, rays_at, tensors, uniform_tree
 from tests.efficientnerf.walls import camera_at, wall
@@ -72,8 +72,6 @@ def test_in_normalised_device_coordinates_too() -> None:
     outputs, other = render(tree, camera), render(wall(), camera)
     np.testing.assert_allclose(outputs.opacity, other.opacity, atol=0.01)
     assert not np.array_equal(outputs.colour, other.colour)
-    from efficientnerf.geometry.cameras import rays
-
     colour, opacity = render_reference(tree, *tensors(*rays(camera)))
     np.testing.assert_allclose(outputs.colour.reshape(-1, 3), colour, atol=1e-3)
     np.testing.assert_allclose(outputs.opacity.reshape(-1), opacity, atol=1e-3)
@@ -102,16 +100,3 @@ def test_derived_trees_keep_the_lookup() -> None:
     tree = nearest(4, 2)
     made = [with_degree(tree, 1), with_resolution(tree, 10), pruned(tree), initial_state(tree).result()]
     assert [each.lookup for each in made] == ["nearest"] * 4
-
-
-@pytest.mark.parametrize(("brick", "degree"), [(1, 0), (4, 2)])
-def test_gradients_of_refinement_match_autograd(brick: int, degree: int) -> None:
-    tree = nearest(brick, degree)
-    origins, directions = rays_at(tree, 200)
-    outputs = seen_at_random(200, 0.7)
-    loss, by_density, by_sh = gradients(tree, origins, directions, outputs)
-    wanted, wanted_by_density, wanted_by_sh = gradients_by_autograd(tree, origins, directions, outputs)
-    np.testing.assert_allclose(loss, wanted, atol=1e-6)
-    np.testing.assert_allclose(by_density, wanted_by_density, atol=1e-6)
-    np.testing.assert_allclose(by_sh, wanted_by_sh, atol=1e-6)
-    assert np.abs(by_density).max() > 1e-3

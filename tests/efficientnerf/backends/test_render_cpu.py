@@ -1,4 +1,4 @@
-"""Images of packed trees: against the torch reference, of every camera model, and what skipping may not change. Parts of the kernel: `test_render_parts`."""
+"""Images of packed trees: against the torch reference, of every camera model, and what skipping may not change; harmonics along rays."""
 
 from dataclasses import replace
 
@@ -9,7 +9,10 @@ import torch
 from efficientnerf.asset.rendering import render, render_rays
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree.packed import packed_of
+from efficientnerf.backends.numba.tree.rendering import render_rays as render_packed
+from efficientnerf.backends.numba.tree.view_colours import sh_basis
 from efficientnerf.geometry.cameras import Camera, rays, resized
+from efficientnerf.rendering.harmonics import basis_numpy
 from tests.efficientnerf.balls import pose
 from tests.efficientnerf.tree_reference import render_reference
 from tests.efficientnerf.trees import in_codes, random_tree, rays_at, uniform_tree
@@ -114,9 +117,17 @@ def test_leaps_in_every_direction_alike_change_no_value(monkeypatch: pytest.Monk
         assert np.array_equal(getattr(usual, name), getattr(other, name)), name
 
 
-def test_harmonics_may_be_evaluated_along_other_directions_than_the_rays() -> None:
-    from efficientnerf.backends.numba.tree.rendering import render_rays
+@pytest.mark.parametrize("degree", range(5))
+def test_the_kernels_harmonics_are_those_of_the_project(degree: int) -> None:
+    directions = np.random.default_rng(0).normal(size=(50, 3))
+    directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
+    for d, row in zip(directions, basis_numpy(directions.astype(np.float64), degree), strict=True):
+        out = np.zeros(len(row), np.float32)
+        sh_basis(*d, degree, out)
+        np.testing.assert_allclose(out, row, atol=2e-6)
 
+
+def test_harmonics_may_be_evaluated_along_other_directions_than_the_rays() -> None:
     tree = uniform_tree(sigma=80.0)
     sh = np.zeros((len(tree.sh), 4, 3), np.float32)
     sh[:, 2] = 1.0  # brighter the more z a direction has
@@ -124,6 +135,6 @@ def test_harmonics_may_be_evaluated_along_other_directions_than_the_rays() -> No
     origins, directions = rays_at(tree, 40)
     sh_directions = np.random.default_rng(1).normal(size=directions.shape)
     sh_directions /= np.linalg.norm(sh_directions, axis=1, keepdims=True)
-    colour, opacity, _, _ = render_rays(tree, origins, directions, sh_directions)
+    colour, opacity, _, _ = render_packed(tree, origins, directions, sh_directions)
     expected = 1 / (1 + np.exp(-0.4886025119029199 * sh_directions[:, 2]))
     np.testing.assert_allclose(colour, (opacity * expected)[:, None] * np.ones(3), atol=1e-4)

@@ -4,66 +4,27 @@ import numba
 import numpy as np
 import pytest
 
-from efficientnerf.backends.numba.vector import halves
+from efficientnerf.backends.numba.vector import halves, maths, memory
 from efficientnerf.backends.numba.vector.corners import mix_corners, spread_corners
 from efficientnerf.backends.numba.vector.halves import mix_pairs, store_halves
-from efficientnerf.backends.numba.vector.maths import (
-    absolute,
-    arctangent,
-    bits_of,
-    broadcast,
-    ceil,
-    exp,
-    exp2_neg,
-    floor,
-    fma,
-    lane_numbers,
-    lowest_bit,
-    mask_of,
-    maximum,
-    minimum,
-    pack,
-    popcount,
-    select,
-    sigmoid,
-    sqrt,
-    sum_each,
-    sum_lanes,
-    to_float32,
-    to_float64,
-    to_int32,
-    unpack,
-)
-from efficientnerf.backends.numba.vector.memory import (
-    gather,
-    gather_groups,
-    load,
-    load_cycle,
-    load_first,
-    load_groups,
-    pointer,
-    store,
-    store_first,
-    store_groups,
-    store_rows,
-)
+from efficientnerf.backends.numba.vector.memory import load, pointer, store
 
 LANES = 32
 
 
 @numba.njit
 def logistics(a, b, c, d):  # type: ignore[no-untyped-def]
-    return unpack(sigmoid(pack((a, b, c, d))))
+    return maths.unpack(maths.sigmoid(maths.pack((a, b, c, d))))
 
 
 @numba.njit
 def power(x):  # type: ignore[no-untyped-def]
-    return exp2_neg(x)
+    return maths.exp2_neg(x)
 
 
 @numba.njit
 def powers(a, b, c, d):  # type: ignore[no-untyped-def]
-    return unpack(exp2_neg(pack((a, b, c, d))))
+    return maths.unpack(maths.exp2_neg(maths.pack((a, b, c, d))))
 
 
 def test_the_kernels_exponential_and_logistic() -> None:
@@ -83,7 +44,7 @@ def half_kernels():  # type: ignore[no-untyped-def]
     @numba.njit(error_model="numpy")
     def rounded(values, out):  # type: ignore[no-untyped-def]
         for n in range(0, len(values), 4):
-            store_halves(pointer(out), n, pack((values[n], values[n + 1], values[n + 2], values[n + 3])))
+            store_halves(pointer(out), n, maths.pack((values[n], values[n + 1], values[n + 2], values[n + 3])))
 
     @numba.njit(error_model="numpy")
     def mixed(weights, bits, at, out):  # type: ignore[no-untyped-def]
@@ -124,18 +85,18 @@ def lane_kernels(count):  # type: ignore[no-untyped-def]
     def in_lanes(floats, ints, bytes_, words, out):  # type: ignore[no-untyped-def]
         x, y = load(pointer(floats), 0, count), load(pointer(floats), count, count)
         less = (x < y) & (x > np.float32(0)) | ~(y >= np.float32(-1))
-        whole = to_int32(absolute(x) + ceil(absolute(y)))
+        whole = maths.to_int32(maths.absolute(x) + maths.ceil(maths.absolute(y)))
         masked = (whole + 3) * whole - 1 & 255 | whole >> 1
         values = (
-            select(less, x * y + np.float32(2), floor(x) - y), minimum(x, y) / maximum(x, np.float32(0.5)),
-            to_float32(masked + (1 << whole)), to_float32(popcount(masked)), sqrt(absolute(x)),
-            to_float32(gather(pointer(ints), whole & 7)), to_float32(gather(pointer(bytes_), whole & 7)),
-            gather(pointer(floats), whole & 31), exp2_neg(absolute(y)), to_float32(load(pointer(words), 1, count)),
-            select(mask_of(40, count), x, np.float32(0)),
+            maths.select(less, x * y + np.float32(2), maths.floor(x) - y), maths.minimum(x, y) / maths.maximum(x, np.float32(0.5)),
+            maths.to_float32(masked + (1 << whole)), maths.to_float32(maths.popcount(masked)), maths.sqrt(maths.absolute(x)),
+            maths.to_float32(memory.gather(pointer(ints), whole & 7)), maths.to_float32(memory.gather(pointer(bytes_), whole & 7)),
+            memory.gather(pointer(floats), whole & 31), maths.exp2_neg(maths.absolute(y)), maths.to_float32(load(pointer(words), 1, count)),
+            maths.select(maths.mask_of(40, count), x, np.float32(0)),
         )  # fmt: skip
         for n in range(11):
             store(pointer(out), count * n, values[n])
-        return bits_of(less), lowest_bit(bits_of(mask_of(40, count)))
+        return maths.bits_of(less), maths.lowest_bit(maths.bits_of(maths.mask_of(40, count)))
 
     return in_lanes
 
@@ -162,14 +123,14 @@ def test_operators_on_lanes_are_numpys(count: int) -> None:
 @numba.njit(error_model="numpy")
 def in_groups(floats, ints, at, out):  # type: ignore[no-untyped-def]
     """What comes of groups of four and of two numbers of a packet."""
-    a, b, c, d = load_groups(pointer(floats), 0, 4, LANES)
+    a, b, c, d = memory.load_groups(pointer(floats), 0, 4, LANES)
     store(pointer(out), 0, a - b + c * d)
-    store_groups(pointer(out), LANES, (a, b))
-    store_groups(pointer(out), 3 * LANES, (a, b, c, d))
-    e, f = gather_groups(pointer(ints), pointer(at), 0, 2, LANES)
-    g, h, i, j = gather_groups(pointer(ints), pointer(at), 0, 4, LANES)
+    memory.store_groups(pointer(out), LANES, (a, b))
+    memory.store_groups(pointer(out), 3 * LANES, (a, b, c, d))
+    e, f = memory.gather_groups(pointer(ints), pointer(at), 0, 2, LANES)
+    g, h, i, j = memory.gather_groups(pointer(ints), pointer(at), 0, 4, LANES)
     for n, value in enumerate((e, f, g, h, i, j)):
-        store(pointer(out), (7 + n) * LANES, to_float32(value))
+        store(pointer(out), (7 + n) * LANES, maths.to_float32(value))
 
 
 def test_groups_of_numbers_go_into_lanes_and_back() -> None:
@@ -188,13 +149,13 @@ def test_groups_of_numbers_go_into_lanes_and_back() -> None:
 def in_doubles(doubles, floats, ints, rows, out):  # type: ignore[no-untyped-def]
     """What operators on lanes of float64 make of two rows of them; rows of eight of the first as float32 and of the three of `floats`; the sum of `ints`."""
     x, y = load(pointer(doubles), 0, LANES), load(pointer(doubles), LANES, LANES)
-    chosen = select((x < y) & (y != 0.5), 1.0 / x - y, maximum(x * 3.0, floor(y)))
-    store(pointer(out), 0, chosen + sqrt(absolute(x)) * sqrt(2.0))
-    store(pointer(out), LANES, to_float64(to_float32(y)) + lane_numbers(LANES) + broadcast(0.25, LANES))
+    chosen = maths.select((x < y) & (y != 0.5), 1.0 / x - y, maths.maximum(x * 3.0, maths.floor(y)))
+    store(pointer(out), 0, chosen + maths.sqrt(maths.absolute(x)) * maths.sqrt(2.0))
+    store(pointer(out), LANES, maths.to_float64(maths.to_float32(y)) + maths.lane_numbers(LANES) + maths.broadcast(0.25, LANES))
     a, b, c = load(pointer(floats), 0, LANES), load(pointer(floats), LANES, LANES), load(pointer(floats), 2 * LANES, LANES)
-    store_rows(pointer(rows), 1, 30, (to_float32(x),), 8)
-    store_rows(pointer(rows), 200, 40, (a, b, c), 8)
-    return sum_lanes(load(pointer(ints), 0, LANES))
+    memory.store_rows(pointer(rows), 1, 30, (maths.to_float32(x),), 8)
+    memory.store_rows(pointer(rows), 200, 40, (a, b, c), 8)
+    return maths.sum_lanes(load(pointer(ints), 0, LANES))
 
 
 def test_lanes_of_float64_and_rows_of_pixels() -> None:
@@ -215,10 +176,10 @@ def test_lanes_of_float64_and_rows_of_pixels() -> None:
 @numba.njit(error_model="numpy")
 def summed(floats, ints, out):  # type: ignore[no-untyped-def]
     x, y = load(pointer(floats), 0, 16), load(pointer(floats), 16, 16)
-    store(pointer(out), 0, sum_each((x, y, x * y)))
-    store_first(pointer(out), 16, load_first(pointer(floats), 3, 5, 16) + np.float32(1), 7)
-    store(pointer(out), 32, load_cycle(pointer(floats), 2, 4, 16))
-    return sum_lanes(x), sum_lanes(load(pointer(ints), 0, 16))
+    store(pointer(out), 0, maths.sum_each((x, y, x * y)))
+    memory.store_first(pointer(out), 16, memory.load_first(pointer(floats), 3, 5, 16) + np.float32(1), 7)
+    store(pointer(out), 32, memory.load_cycle(pointer(floats), 2, 4, 16))
+    return maths.sum_lanes(x), maths.sum_lanes(load(pointer(ints), 0, 16))
 
 
 def test_sums_over_lanes_parts_of_vectors_and_cycles() -> None:
@@ -238,9 +199,9 @@ def test_sums_over_lanes_parts_of_vectors_and_cycles() -> None:
 @numba.njit(error_model="numpy")
 def functions(floats, out):  # type: ignore[no-untyped-def]
     x = load(pointer(floats), 0, 32)
-    store(pointer(out), 0, exp(x))
-    store(pointer(out), 32, arctangent(absolute(x)))
-    store(pointer(out), 64, fma(x, np.float32(3), x))
+    store(pointer(out), 0, maths.exp(x))
+    store(pointer(out), 32, maths.arctangent(maths.absolute(x)))
+    store(pointer(out), 64, maths.fma(x, np.float32(3), x))
 
 
 def test_exponentials_and_arc_tangents() -> None:
