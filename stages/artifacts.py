@@ -1,18 +1,14 @@
 """The files of each stage's artifact; each file name is stated here, once.
 
-A stage writes `XOutputs(job.out)`, reads `inputs_of(XInputs, job.inputs)` and needs `needs_of(XInputs)`; a workflow reads `XOutputs.of_run(run)`.
-A new stage states its pair in its own `settings.py`, or here if an earlier stage or `stages.io` has to know its files. The poses stage reads the source alone.
+A stage writes `XOutputs(job.out)` and reads `YOutputs(job.inputs["y"])` of each stage y that it needs; a workflow reads `XOutputs.of_run(run)`.
+A new stage states its own in its `settings.py`, or here if an earlier stage or `stages.io` has to know its files.
 """
 
 from __future__ import annotations
 
-import typing
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Self, TypeVar, overload
-
-T = TypeVar("T")
+from typing import ClassVar, Self, overload
 
 
 class Name:
@@ -142,62 +138,3 @@ class SplatsOutputs(Outputs):
     spz = Name("splats.spz")  # the same, small, y up
     preview = Name("preview.png")  # next to the asset
     report = Name("report.json")  # how many, bytes, seconds
-
-
-@dataclass(frozen=True)
-class TrainInputs:
-    poses: PosesOutputs
-
-
-@dataclass(frozen=True)
-class BakeInputs:
-    poses: PosesOutputs
-    train: TrainOutputs
-
-
-@dataclass(frozen=True)
-class SplatsInputs:
-    bake: BakeOutputs
-    train: TrainOutputs
-    poses: PosesOutputs
-
-
-@dataclass(frozen=True)
-class EvaluateInputs:
-    mesh: MeshOutputs
-    splats: SplatsOutputs
-    bake: BakeOutputs
-    train: TrainOutputs
-    poses: PosesOutputs
-
-
-@dataclass(frozen=True)
-class TurntableInputs:
-    bake: BakeOutputs
-
-
-@dataclass(frozen=True)
-class MeshInputs:
-    bake: BakeOutputs
-    train: TrainOutputs
-    poses: PosesOutputs
-
-
-@dataclass(frozen=True)
-class PointsInputs:
-    mesh: MeshOutputs
-    bake: BakeOutputs
-
-
-def inputs_of(kind: type[T], folders: Mapping[str, Path]) -> T:
-    """The inputs of a stage: a dataclass whose fields are named as the stages it needs and typed by their Outputs.
-
-    folders  stage -> folder of its artifact, as `Job.inputs` holds them
-    """
-    outputs = typing.get_type_hints(kind)
-    return kind(**{need: outputs[need](folders[need]) for need in needs_of(kind)})
-
-
-def needs_of(kind: type) -> tuple[str, ...]:
-    """The names of the stages whose outputs a dataclass of inputs holds."""
-    return tuple(field.name for field in fields(kind))

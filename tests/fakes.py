@@ -107,9 +107,9 @@ class BallTree:
         near, far = np.maximum(middle - half, 0.0), np.maximum(middle + half, 0.0)
         return 1.0 - np.exp(-self.sigma * np.maximum(np.minimum(far, limits) - near, 0.0))
 
-    def evaluated(self, **more: Any) -> EvaluatedAsset:
+    def evaluated(self) -> EvaluatedAsset:
         """As the evaluate stage sees it; margins of 2 % of the distance."""
-        return EvaluatedAsset(self.render, limits=lambda origins, directions, distance: 0.98 * distance, nearer=self.opacity_nearer, **more)
+        return EvaluatedAsset(self.render, limits=lambda origins, directions, distance: 0.98 * distance, nearer=self.opacity_nearer)
 
     def render(
         self, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1, normals: bool = True

@@ -17,7 +17,7 @@ from pipeline.errors import BadInput, UsageError
 from pipeline.executors.memory import Limit
 from pipeline.files import write_atomically
 from pipeline.stage import Stage, settings_from
-from stages.artifacts import BakeOutputs, MeshInputs, MeshOutputs, PosesOutputs, TrainOutputs
+from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs, TrainOutputs
 from stages.formats.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS, Format, cameras
 from stages.formats.exporters.writing import SourceFrame, source_frame
 from stages.framing.restriction import restricted
@@ -235,10 +235,10 @@ def _meshed(export: Export, tree: NerfTree, border: Region | None, frame: Source
     if wanted.texture == "photographs" and not export.has_photographs:
         raise UsageError(f"{export.what}: holds no photographs. Give a run with its cameras, or --texture asset.")
     choice = "asset" if wanted.texture == "auto" and not export.has_photographs else wanted.texture
-    inputs = MeshInputs(*(kind.of_run(export.what) for kind in (BakeOutputs, TrainOutputs, PosesOutputs)))  # type: ignore[arg-type]
+    captured = PosesOutputs.of_run(export.what).folder, TrainOutputs.of_run(export.what).folder
     side = 0 if choice == "off" else wanted.texture_size
     remedy = "Take an asset of fewer voxels (enerf convert --resolution)" + (", or a smaller texture (--texture-size)." if side else ".")
-    need = surface_needed(tree, texture=side, pixels=largest_photograph(inputs, choice))
+    need = surface_needed(tree, texture=side, pixels=largest_photograph(captured[0], choice))
     refuse_more_than(export.limit, str(export.what), need, remedy)
     share = 1.0 if choice == "off" else SURFACE_SHARE
 
@@ -248,7 +248,7 @@ def _meshed(export: Export, tree: NerfTree, border: Region | None, frame: Source
     def texture(done: int, total: int, text: str) -> None:
         progress(round(1000 * (share + (1 - share) * done / max(total, 1))), 1000, text)
 
-    return in_capture(textured(mesh_of(tree, wanted, surface, region=border), tree, inputs, choice, wanted.texture_size, texture), frame)
+    return in_capture(textured(mesh_of(tree, wanted, surface, region=border), tree, captured, choice, wanted.texture_size, texture), frame)
 
 
 def _write_mesh(export: Export, mesh: Mesh, frame: SourceFrame) -> list[Written]:

@@ -11,7 +11,7 @@ from efficientnerf.rendering.harmonics import harmonics_count
 from efficientnerf.training.pixels import PixelRows, Pixels
 from pipeline.executors.memory import size_text
 from pipeline.stage import Job
-from stages.artifacts import BakeInputs
+from stages.artifacts import PosesOutputs, TrainOutputs
 from stages.bake.plan import Bake, SceneBake, bake_plan, coarse_cells
 from stages.bake.settings import BakeSettings
 from stages.bake.voxels import Voxels
@@ -119,7 +119,7 @@ def refuse_more_than_fits(job: Job, plan: Bake, m: Model, views: tuple[View, ...
 def memory_needed(known: Known) -> Need:
     """Most memory of the stage bake, before its voxels are counted."""
     plan, m, views = _before(known)
-    channels = channels_of(known.inputs(BakeInputs).poses.folder, views)
+    channels = channels_of(PosesOutputs.of_run(known.run).folder, views)
     return most_needed(known.settings["bake"], plan, m, views, channels, plan.most_voxels, stored=False, device=known.device)
 
 
@@ -135,6 +135,6 @@ def space_needed(known: Known) -> int:
 
 def _before(known: Known) -> tuple[Bake, Model, tuple[View, ...]]:
     """The plan, the model and the training views."""
-    inputs = known.inputs(BakeInputs)
-    m, s = load_renderer(inputs.train.folder).model, load_scene(inputs.poses.folder, inputs.train.folder)
+    poses, train = PosesOutputs.of_run(known.run).folder, TrainOutputs.of_run(known.run).folder
+    m, s = load_renderer(train).model, load_scene(poses, train)
     return bake_plan(known.settings["bake"], m, s, known.device, count_cores()), m, views_of(s, "train")

@@ -9,15 +9,15 @@ from efficientnerf.capture.forward_facing import ForwardFacing
 from efficientnerf.model import Model
 from pipeline.hashes import sha256_of
 from pipeline.stage import Job
-from stages.artifacts import BakeInputs, inputs_of
+from stages.artifacts import PosesOutputs, TrainOutputs
 from stages.bake.settings import BakeSettings
 from stages.io.scene import Scene, similarity_to_json
 
 
 def sources_of(job: Job) -> dict[str, str]:
     """SHA-256 of the files that the asset was made from: cameras and field."""
-    inputs = inputs_of(BakeInputs, job.inputs)
-    return {path.name: sha256_of(path) for path in (inputs.poses.scene, inputs.train.field)}
+    files = PosesOutputs(job.inputs["poses"]).scene, TrainOutputs(job.inputs["train"]).field
+    return {path.name: sha256_of(path) for path in files}
 
 
 def metadata_of(s: Scene, settings: BakeSettings, m: Model) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from efficientnerf.asset.components import foreground_bricks
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.tree import NerfTree
 from pipeline.stage import Job
-from stages.artifacts import BakeInputs, BakeOutputs, inputs_of
+from stages.artifacts import BakeOutputs
 from stages.bake.economy import packed_tree
 from stages.bake.memory import refuse_more_than_fits, rows_for_baking
 from stages.bake.metadata import metadata_of, sources_of
@@ -48,24 +48,24 @@ PSNR_BYTES = 16  # by which a header grows at most, once the PSNR of what is wri
 
 @compiling_kernels
 def run(job: Job) -> None:
-    stopwatch, settings, inputs = Stopwatch(), job.settings, inputs_of(BakeInputs, job.inputs)
+    stopwatch, settings, poses, train = Stopwatch(), job.settings, job.inputs["poses"], job.inputs["train"]
     use_all_cores()
-    m = load_renderer(inputs.train.folder, job.device).model
+    m = load_renderer(train, job.device).model
     refuse_nerf(m.settings)
-    s = load_scene(inputs.poses.folder, inputs.train.folder)
+    s = load_scene(poses, train)
     views = scene.views_of(s, "train")
     plan = with_noted_size(job, bake_plan(settings, m, s, job.device, count_cores()))
     for text in unused_settings(settings, m, plan):
         job.warn(text)
 
-    pixels = pixels_of(inputs.poses.folder, views, rows_for_baking(job, plan, m, views), inputs.train.folder)
+    pixels = pixels_of(poses, views, rows_for_baking(job, plan, m, views), train)
     voxels = choose_voxels(job, plan, m, s, pixels)
     refuse_more_than_fits(job, plan, m, views, pixels, voxels)
     metadata, around = metadata_of(s, settings, m), voxels.surroundings
     targets = Targets(pixels, plan.background, None if around is None else around.environment, reaches_infinity=plan.space.reaches_infinity)
     # The raw values have no name here: they are large, and not needed once the refinement has its own.
     tree, report = refined(job, s, plan, voxels, baked_tree(job, m, s, plan, voxels, metadata), targets, stopwatch)
-    if tree.region is not None and not bounds_are_given(inputs.poses.folder):
+    if tree.region is not None and not bounds_are_given(poses):
         tree = replace(tree, region=replace(tree.region, bricks=foreground_bricks(tree)))
 
     metrics = {"training_psnr": report["psnr_after"]}

@@ -10,7 +10,7 @@ from efficientnerf.settings import LEAST_RESOLUTION, Auto, Count, Fraction, NonN
 from efficientnerf.training.settings import TrainSettings
 from pipeline.errors import UsageError
 from pipeline.stage import ByName, Stage
-from stages.artifacts import BakeInputs, BakeOutputs, needs_of
+from stages.artifacts import BakeOutputs
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ STAGE = Stage(
     name="bake",
     version=26,
     settings=BakeSettings,
-    needs=needs_of(BakeInputs),
+    needs=("poses", "train"),
     run=ByName("stages.bake.run:run"),
     uses_device=True,
     check=check,

@@ -13,27 +13,26 @@ learned but predicted by those of its neighbours (`efficientnerf.training.exposu
 render's colours, twelve numbers a view, that fits the photograph best (`metrics.colour_fitted`).
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from efficientnerf.asset.rendering import Rendering
 from efficientnerf.evaluation.lpips import SMALLEST, Lpips
 from efficientnerf.evaluation.metrics import colour_fitted
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.rendering.field_renderer import FieldRenderer
 from pipeline.errors import BadInput
 from pipeline.stage import Job
-from stages.artifacts import PosesOutputs
-from stages.evaluate.asset import EvaluatedAsset, is_over_field, over_field, render_asset
+from stages.evaluate.asset import EvaluatedAsset, over_field
 from stages.evaluate.lpips_weights import find_weights
 from stages.evaluate.mesh import EvaluatedMesh, mesh_image, mesh_metrics
 from stages.evaluate.sparse_points import ReliablePoints, counts_of, judged
-from stages.evaluate.splats import EvaluatedSplats, splats_image
+from stages.evaluate.splats import EvaluatedSplats
 from stages.evaluate.trivial import blurred_psnrs, mean_colour_psnr
 from stages.evaluate.views import GroundTruth, constant_background, ground_truth, subsample, subsample_camera, upsample
 from stages.figures.plots import error_map, to_uint8
@@ -48,56 +47,86 @@ AGAINST_NETWORK = ("holes", "floaters", "holes_excess_error", "floaters_excess_e
 SAMPLE_SHARES = ("valid_share", "pivotal_share", "fine_per_ray")
 
 
-def evaluate_view(
-    asset: EvaluatedAsset, mesh: EvaluatedMesh, field: FieldRenderer | None, scene: Scene, view: View, job: Job, *, with_field: bool, stride: int,
-    perceptual: Mapping[str, Lpips] | None = None, splats: EvaluatedSplats | None = None, points: ReliablePoints | None = None,
-    taken: Taken | None = None,
-) -> tuple[dict[str, Any], list[np.ndarray]]:
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What is measured on the views of a scene.
+
+    splats      None: the run has none of the whole scene
+    points      that the asset's depth is compared with; None: there are none
+    taken       `stages.train.averaged.as_taken`
+    perceptual  LPIPS networks by the name of their metric
+    """
+
+    job: Job
+    scene: Scene
+    asset: EvaluatedAsset
+    mesh: EvaluatedMesh
+    splats: EvaluatedSplats | None
+    points: ReliablePoints | None
+    taken: Taken | None
+    perceptual: Mapping[str, Lpips]
+
+    @property
+    def background(self) -> tuple[float, float, float] | None:
+        """Constant, behind the asset; None: it has its own surroundings."""
+        return constant_background(self.scene)
+
+    def truth(self, view: View) -> GroundTruth:
+        """The photograph."""
+        return ground_truth(self.job.inputs["poses"], view, self.scene.background)
+
+    def rendering(self, view: View) -> Rendering:
+        """The asset as the view's camera sees it, without normals."""
+        found: Rendering = self.asset.render(view.camera, background=self.background, normals=False)
+        return found
+
+    def shown(self, view: View, image: np.ndarray, what: str, stride: int = 1) -> np.ndarray:
+        """A render of every stride-th pixel of a view as it is compared: clipped to 0-1, and as the view's camera shows it. Pixels that are not finite count
+        as black, with a warning."""
+        bad = int((~np.isfinite(image)).any(axis=-1).sum())
+        if bad:
+            self.job.warn(f"{view.name}: {what} is not finite at {bad} pixels, which count as black")
+        image = np.clip(np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
+        return image if self.taken is None else self.taken(view, image, stride)
+
+
+def evaluate_view(e: Evaluation, view: View, field: FieldRenderer | None, stride: int) -> tuple[dict[str, Any], list[np.ndarray]]:
     """The metrics of one view, and its images for the contact sheet: ground truth, field and its error if it is measured, asset and its error.
 
-    with_field  whether the field is measured; else it renders the surroundings of an asset without any, and nothing where these are constant
-    stride      of the pixels that the field renders
-    perceptual  LPIPS networks by the name of their metric
-    points      that the asset's depth is compared with
-    taken       `stages.train.averaged.as_taken`
+    field   None: it is not measured on this view
+    stride  of the pixels that it renders
     """
-    truth = ground_truth(job.inputs[PosesOutputs.stage], view, scene.background)
-    shown = partial(as_shown, job, view, taken)
-    unbounded = constant_background(scene) is None
+    truth, asset, seen = e.truth(view), e.asset, None
     metrics: dict[str, Any] = {"name": view.name, "network": None, "asset_with_network_background": None, "gap": None, **dict.fromkeys(AGAINST_NETWORK)}
     images: list[np.ndarray] = []
-    seen = None
-    if field is not None and (with_field or is_over_field(asset, scene)):
-        small_camera = subsample_camera(view.camera, stride)
-        limits = asset.limits if with_field else None
-        seen = field.render(small_camera, progress=lambda *_: job.safe_point(), box=asset.box, reach=asset.reach, limits=limits)
-    image, opacity, depth = render_asset(asset, scene, view, seen, stride)
-    image = shown(image, "the asset")
-    metrics |= {"trivial": trivial(truth), "sparse_points": None if points is None else against_points(points, scene, view, depth, truth)}
+    small_camera = subsample_camera(view.camera, stride)
+    if field is not None:
+        seen = field.render(small_camera, progress=lambda *_: e.job.safe_point(), box=asset.box, reach=asset.reach, limits=asset.limits)
+    output = e.rendering(view)
+    image = e.shown(view, output.colour, "the asset")
+    metrics |= {"trivial": trivial(truth), "sparse_points": None if e.points is None else against_points(e.points, e.scene, view, output.depth, truth)}
     size = {"width": view.camera.width, "height": view.camera.height}
-    inside = upsample(seen.inside_opacity, stride, **size) >= 0.5 if unbounded and seen is not None else truth.inside
-    metrics["asset"] = {**compare(image, truth, inside), **size, **lpips_metrics(perceptual or {}, image, truth)}
-    if is_over_field(asset, scene):
-        metrics["asset"]["background_scale"] = 1.0 / stride
-    drawn, plain, covered, depth = mesh_image(mesh, asset, scene, view, seen, stride)
-    metrics["mesh"] = mesh_metrics(shown(drawn, "the mesh"), shown(plain, "the mesh"), covered, depth, image, truth, view.camera)
-    if splats is not None:
-        drawn = shown(splats_image(splats, asset, scene, view), "the Gaussians")
+    inside = truth.inside if seen is None or asset.inner is None else upsample(seen.inside_opacity, stride, **size) >= 0.5
+    metrics["asset"] = {**compare(image, truth, inside), **size, **lpips_metrics(e.perceptual, image, truth)}
+    drawn, plain, covered, depth = mesh_image(e.mesh, view.camera, e.background)
+    metrics["mesh"] = mesh_metrics(e.shown(view, drawn, "the mesh"), e.shown(view, plain, "the mesh"), covered, depth, image, truth, view.camera)
+    if e.splats is not None:
+        drawn = e.shown(view, e.splats.draw(view.camera, e.background), "the Gaussians")
         metrics["splats"] = {"psnr": truth.psnr(drawn), "ssim": truth.ssim(drawn)}
-    if with_field and seen is not None:
+    if seen is not None:
         small = truth.subsampled(stride)
-        render = shown(seen.colour, "the field", stride)
-        inside = seen.inside_opacity >= 0.5 if unbounded else small.inside
+        render = e.shown(view, seen.colour, "the field", stride)
+        inside = small.inside if asset.inner is None else seen.inside_opacity >= 0.5
         network = {**compare(render, small, inside), "width": render.shape[1], "height": render.shape[0], **sample_shares(seen.counts)}
-        metrics["network"] = network | lpips_metrics(perceptual or {}, render, small)
-        same_image, same_opacity = subsample(image, stride), subsample(opacity, stride)
-        metrics |= differences(asset, subsample_camera(view.camera, stride), same_image, same_opacity, replace(seen, colour=render), small, metrics["network"])
-        if unbounded and asset.inner is not None:
-            other = shown(over_field(asset.inner, view, seen, stride)[0], "the asset over the field")
+        metrics["network"] = network | lpips_metrics(e.perceptual, render, small)
+        same_image, same_opacity = subsample(image, stride), subsample(output.opacity, stride)
+        metrics |= differences(asset, small_camera, same_image, same_opacity, replace(seen, colour=render), small, metrics["network"])
+        if asset.inner is not None:
+            other = e.shown(view, over_field(asset.inner, view, seen, stride), "the asset over the field")
             metrics["asset_with_network_background"] = {**compare(other, truth, upsample(seen.inside_opacity, stride, **size) >= 0.5), **size}
         images += [to_uint8(small.colour), to_uint8(render), error_map(render, small.colour)]
     if metrics["asset"]["psnr"] is None:
-        job.warn(f"{view.name}: its mask leaves no pixel to compare; the view is not part of the means")
+        e.job.warn(f"{view.name}: its mask leaves no pixel to compare; the view is not part of the means")
     return metrics, [*images, to_uint8(image), error_map(image, truth.colour)]
 
 
@@ -194,29 +223,9 @@ def compare(image: np.ndarray, truth: GroundTruth, inside: np.ndarray | None) ->
     }
 
 
-def as_shown(job: Job, view: View, taken: Taken | None, image: np.ndarray, what: str, stride: int = 1) -> np.ndarray:
-    """A render of every stride-th pixel of a view as it is compared: clipped, and as the view's camera shows it."""
-    image = clipped(image, job, f"{view.name}: {what}")
-    return image if taken is None else taken(view, image, stride)
-
-
-def clipped(image: np.ndarray, job: Job, what: str) -> np.ndarray:
-    """Clipped to 0-1; pixels that are not finite count as black, with a warning."""
-    bad = int((~np.isfinite(image)).any(axis=-1).sum())
-    if bad:
-        job.warn(f"{what} is not finite at {bad} pixels, which count as black")
-    return np.clip(np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
-
-
-def load_lpips(network: str, folder: str | None, *, bundled: Sequence[Path] | None = None) -> Lpips:
-    """The metric by "alex" or "vgg".
-
-    folder   searched first, for the network and for the heads
-    bundled  folders that are searched for the heads then; None: that of the package torchmetrics
-
-    Raises UsageError, which names what is missing and where to get it.
-    """
-    backbone, heads = find_weights(network, folder, bundled=bundled)
+def load_lpips(network: str, folder: str | None) -> Lpips:
+    """The metric by "alex" or "vgg"; see `find_weights`. Raises UsageError where weights are missing."""
+    backbone, heads = find_weights(network, folder)
     try:
         return Lpips(network, _state(backbone), _state(heads))
     except ValueError as error:

@@ -1,7 +1,6 @@
 """Finding the weights of LPIPS: in a given folder, in torch's cache of downloads, and, for the heads, in the package torchmetrics."""
 
 import os
-from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -11,17 +10,16 @@ BACKBONES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
 SITE = "https://download.pytorch.org/models/"
 
 
-def find_weights(network: str, folder: str | None, *, bundled: Sequence[Path] | None = None) -> tuple[Path, Path]:
-    """The files of the network and of the heads; see `stages.evaluate.comparison.load_lpips`."""
+def find_weights(network: str, folder: str | None) -> tuple[Path, Path]:
+    """The files of the network, "alex" or "vgg", and of the heads; `folder` is searched first. UsageError says what is missing and where to get it."""
     places = [Path(folder)] if folder else []
     hub = Path(os.environ.get("TORCH_HOME", Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "torch")).expanduser() / "hub" / "checkpoints"
     backbone = _found(BACKBONES[network], [*places, hub], f"Download {SITE}{BACKBONES[network]} into one of them, or name its folder: evaluate.lpips_weights.")
-    folders = [*places, *(in_torchmetrics() if bundled is None else bundled)]
-    heads = _found(f"{network}.pth", folders, "Install the extra that brings it: pip install 'efficientnerf[lpips]'.")
+    heads = _found(f"{network}.pth", [*places, *_in_torchmetrics()], "Install the extra that brings it: pip install 'efficientnerf[lpips]'.")
     return backbone, heads
 
 
-def in_torchmetrics() -> list[Path]:
+def _in_torchmetrics() -> list[Path]:
     """The folder of the heads in torchmetrics, which is not imported."""
     spec = find_spec("torchmetrics")
     return [Path(place) / "functional" / "image" / "lpips_models" for place in (spec.submodule_search_locations or [])] if spec is not None else []

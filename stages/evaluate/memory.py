@@ -1,12 +1,14 @@
 """Memory of comparing renders with photographs, one view at a time. docs/experiments/memory.md"""
 
 import math
+from collections.abc import Mapping
+from pathlib import Path
 
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.settings import resolved
 from efficientnerf.surface.shading import AT_ONCE
-from stages.artifacts import EvaluateInputs
-from stages.evaluate.settings import MAX_FIELD_IMAGE_SIZE, EvaluateSettings
+from stages.artifacts import MeshOutputs, PosesOutputs, TrainOutputs
+from stages.evaluate.settings import MAX_FIELD_IMAGE_SIZE, STAGE, EvaluateSettings
 from stages.evaluate.strips import STRIP_RAYS
 from stages.evaluate.views import evaluation_views
 from stages.io.scene import load
@@ -24,9 +26,9 @@ FIELD = 150  # bytes of a ray through the field, with what lies before and behin
 FIELD_BLOCK = 400 * MIB  # the samples of a block of rays through a field whose density voxels prune nothing yet
 
 
-def needed(tree: NerfTree, settings: EvaluateSettings, inputs: EvaluateInputs, device: str) -> Need:
-    """Memory of the stage evaluate."""
-    cameras = [view.camera for view in evaluation_views(load(inputs.poses.folder))[0]]
+def needed(tree: NerfTree, settings: EvaluateSettings, inputs: Mapping[str, Path], device: str) -> Need:
+    """Memory of the stage evaluate; `inputs` as of its job."""
+    cameras = [view.camera for view in evaluation_views(load(inputs["poses"]))[0]]
     scale = resolved(settings.field_image_scale)
     most = max(camera.width * camera.height for camera in cameras)
     rays = MAX_FIELD_IMAGE_SIZE**2 if scale is None else math.ceil(scale**2 * most)
@@ -34,22 +36,23 @@ def needed(tree: NerfTree, settings: EvaluateSettings, inputs: EvaluateInputs, d
         rays = max(rays, min(most, STRIP_RAYS))
     return Need({
         "a view": most * (COMPARED + DRAWN),
-        "the mesh": mesh_bytes(inputs.mesh) + SAMPLE * AT_ONCE,
+        "the mesh": mesh_bytes(MeshOutputs(inputs["mesh"])) + SAMPLE * AT_ONCE,
         "its rays": rays * FIELD + FIELD_BLOCK,
         "the asset": tree_bytes(tree) * (3 if tree.outer else 1),  # cascade 0 alone, and what surrounds the mesh
-        "the field": 3 * inputs.train.field.stat().st_size,
+        "the field": 3 * TrainOutputs(inputs["train"]).field.stat().st_size,
         "libraries": libraries(device),
     })  # fmt: skip
 
 
 def memory_needed(known: Known) -> Need:
     """`needed` for all of the asset."""
-    return needed(asset_of(known), known.settings["evaluate"], known.inputs(EvaluateInputs), known.device)
+    inputs = {name: known.run / name for name in STAGE.needs}
+    return needed(asset_of(known), known.settings["evaluate"], inputs, known.device)
 
 
 def space_needed(known: Known) -> int:
     """Strips, thumbnails in scratch and on a sheet, and a video."""
     own = known.settings["evaluate"]
-    pixels = [view.camera.width * view.camera.height for view in evaluation_views(load(known.inputs(EvaluateInputs).poses.folder))[0]]
+    pixels = [view.camera.width * view.camera.height for view in evaluation_views(load(PosesOutputs.of_run(known.run).folder))[0]]
     strips, thumbnails = STRIPS * max(pixels), sum(min(each, THUMBNAIL) for each in pixels)
     return SHEET + WRITTEN * (strips + PICTURES * thumbnails) + (resolved(own.captured_path_frames) or 0) * max(pixels) // 4

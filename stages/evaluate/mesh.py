@@ -1,7 +1,7 @@
 """The mesh against the photographs: drawn from the held-back cameras in its own colours, unlit, before what of the asset is not in it.
 
-Behind the mesh is what is behind the asset in its own figures: a constant background, the asset without its foreground region (nearer parts of it hide the
-mesh), or what the field shows before and behind the box of an asset that holds no surroundings. So `psnr` is of whole photographs, as the asset's own.
+Behind the mesh is what is behind the asset in its own figures: a constant background, or the asset without its foreground region (nearer parts of it hide
+the mesh). So `psnr` is of whole photographs, as the asset's own.
 
 psnr_covered        over the pixels that the mesh covers by half or more; asset_psnr_covered: the asset's on the same
 covered             their share of the pixels that count
@@ -23,10 +23,9 @@ from efficientnerf.surface.mesh import Mesh, moved
 from efficientnerf.surface.roughness import roughness
 from efficientnerf.surface.shading import ColouredImage, Shader
 from stages.artifacts import MeshOutputs
-from stages.evaluate.asset import EvaluatedAsset, RenderTree, is_over_field
-from stages.evaluate.views import GroundTruth, constant_background, upsample
+from stages.evaluate.asset import RenderTree
+from stages.evaluate.views import GroundTruth
 from stages.formats.exporters.writing import source_frame
-from stages.io.scene import Scene, View
 from stages.mesh.files import read_mesh
 
 FIGURES = ("psnr", "ssim", "psnr_covered", "psnr_vertex_colours", "ssim_vertex_colours", "asset_psnr_covered", "covered", "roughness")
@@ -62,30 +61,20 @@ def load_mesh(outputs: MeshOutputs, tree: NerfTree, region: str) -> EvaluatedMes
     return evaluated_mesh(mesh, around)
 
 
-def mesh_image(
-    mesh: EvaluatedMesh, asset: EvaluatedAsset, scene: Scene, view: View, seen: Any, stride: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The image of a view (H, W, 3) with the mesh in its texture, that with it in the colours of its vertices, the mesh's share of each pixel (H, W), and
+def mesh_image(mesh: EvaluatedMesh, camera: Camera, background: tuple[float, float, float] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The image of a camera (H, W, 3) with the mesh in its texture, that with it in the colours of its vertices, the mesh's share of each pixel (H, W), and
     its depth along the view axis (H, W), infinite where it is not seen.
 
-    seen  the field's rendering on every stride-th pixel, where the asset is composited with it; else it is not used
+    background  constant, behind the asset; None: its surroundings
     """
-    textured, plain = mesh.shader.images(view.camera)
-    over_field = is_over_field(asset, scene)
-    behind = None if over_field else constant_background(scene) or asset.behind
-    around = None if mesh.surroundings is None else mesh.surroundings(view.camera, background=behind, normals=False)
-    size = (view.camera.height, view.camera.width, 3)
-    rest = np.broadcast_to(np.asarray(behind or (0.0, 0.0, 0.0), np.float32), size) if around is None else around.colour
+    textured, plain = mesh.shader.images(camera)
+    around = None if mesh.surroundings is None else mesh.surroundings(camera, background=background, normals=False)
+    size = (camera.height, camera.width, 3)
+    rest = np.broadcast_to(np.asarray(background or (0.0, 0.0, 0.0), np.float32), size) if around is None else around.colour
     hidden = np.zeros(size[:2], bool) if around is None else around.depth < (1 - MARGIN) * textured.depth
-    before = None
-    if over_field:
-        stretch = (stride, view.camera.width, view.camera.height)
-        farther, before = upsample(seen.behind, *stretch), upsample(seen.before, *stretch)
-        rest = rest + (1.0 - (0.0 if around is None else around.opacity[..., None])) * farther
 
     def image(drawn: ColouredImage) -> np.ndarray:
-        middle = np.where(hidden[..., None], rest, drawn.colour + (1 - drawn.covered[..., None]) * rest)
-        return np.asarray(middle if before is None else before[..., :3] + (1.0 - before[..., 3:]) * middle, np.float32)
+        return np.asarray(np.where(hidden[..., None], rest, drawn.colour + (1 - drawn.covered[..., None]) * rest), np.float32)
 
     return image(textured), image(plain), np.where(hidden, 0, textured.covered), np.where(hidden, np.inf, textured.depth)
 

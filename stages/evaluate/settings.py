@@ -8,7 +8,6 @@ from msgspec import Meta
 
 from efficientnerf.settings import Auto, Off, PositiveInt, resolved, setting
 from pipeline.stage import ByName, Stage
-from stages.artifacts import EvaluateInputs, needs_of
 from stages.evaluate.lpips_weights import find_weights
 
 MAX_FIELD_IMAGE_SIZE = 400  # pixels: the longest side of the field's renders where evaluate.field_image_scale is not given
@@ -28,7 +27,7 @@ class EvaluateSettings:
         advanced=True,
     )
     field_background_rays: PositiveInt = setting(
-        500_000, "Total number of rays through the field for the surroundings of the other views, in unbounded scenes whose asset has none.", advanced=True
+        500_000, "Has no effect: assets of unbounded scenes have their own surroundings. It stays so that settings of earlier runs are read.", advanced=True
     )
     strips: Literal["on", "off"] = setting(
         "on", "Whether to show photograph, network, asset and mesh side by side at full size, for the worst, the median and the best view."
@@ -56,7 +55,7 @@ STAGE = Stage(
     name="evaluate",
     version=14,
     settings=EvaluateSettings,
-    needs=needs_of(EvaluateInputs),
+    needs=("mesh", "splats", "bake", "train", "poses"),
     run=ByName("stages.evaluate.run:run"),
     uses_device=True,
     check=check,

@@ -10,12 +10,9 @@ from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.splats.rendering import render
 from stages.artifacts import SplatsOutputs
-from stages.evaluate.asset import EvaluatedAsset
-from stages.evaluate.views import constant_background
 from stages.formats.exporters.splats.frames import moved
 from stages.formats.exporters.splats.ply import read_splats
 from stages.formats.exporters.writing import source_frame
-from stages.io.scene import Scene, View
 from stages.reports import RegionReport, read_report
 
 FIGURES = ("psnr", "ssim")
@@ -41,8 +38,3 @@ def load_splats(outputs: SplatsOutputs, tree: NerfTree) -> EvaluatedSplats | Non
     gaussians = moved(read_splats(outputs.ply), source_frame(tree.metadata).world_from_capture)
     facts = {"gaussians": len(gaussians), "ply_bytes": outputs.ply.stat().st_size}
     return EvaluatedSplats(lambda camera, background: render(gaussians, camera, background, tree.device).colour, facts)
-
-
-def splats_image(splats: EvaluatedSplats, asset: EvaluatedAsset, scene: Scene, view: View) -> np.ndarray:
-    """(H, W, 3), on what is behind the asset; on black where its environment map is, which the Gaussians have as their own."""
-    return splats.draw(view.camera, constant_background(scene) or asset.behind)

@@ -11,24 +11,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from efficientnerf.rendering.field_renderer import FieldRenderer
-from pipeline.stage import Job
-from stages.artifacts import EvaluateOutputs, PosesOutputs
-from stages.evaluate.asset import EvaluatedAsset, is_over_field, render_asset
-from stages.evaluate.comparison import as_shown
-from stages.evaluate.mesh import EvaluatedMesh, mesh_image
+from stages.artifacts import EvaluateOutputs
+from stages.evaluate.comparison import Evaluation
+from stages.evaluate.mesh import mesh_image
 from stages.evaluate.summary import quality
-from stages.evaluate.views import ground_truth, stride_for, subsample, subsample_camera
+from stages.evaluate.views import stride_for, subsample, subsample_camera
 from stages.figures.plots import contact_sheet
 from stages.io.png import read_png
-from stages.io.scene import Scene, View
+from stages.io.scene import View
 from stages.scratch import Warn, note, noted
-from stages.train.averaged import Taken
 
 STRIP_RAYS = 2**20  # through the field, for one strip
-FIGURES = ("psnr", "ssim")
 
 
 def strip_views(figures: Sequence[Mapping[str, Any]]) -> list[tuple[str, int]]:
@@ -41,20 +35,18 @@ def strip_views(figures: Sequence[Mapping[str, Any]]) -> list[tuple[str, int]]:
 
 
 def write_strips(
-    asset: EvaluatedAsset, mesh: EvaluatedMesh, load_field: Callable[[], FieldRenderer], scene: Scene, views: Sequence[View], chosen: Sequence[tuple[str, int]],
-    job: Job, warn: Warn, taken: Taken | None = None,
+    e: Evaluation, load_field: Callable[[], FieldRenderer], views: Sequence[View], chosen: Sequence[tuple[str, int]], warn: Warn
 ) -> list[dict[str, Any]]:
     """Write the strips of the chosen views; returns their entries of metrics.json. A strip is kept in job.work, so that a kill costs at most one."""
     entries: list[dict[str, Any]] = []
-    started, rays = time.monotonic(), 0
+    job, started, rays = e.job, time.monotonic(), 0
     for which, k in chosen:
         job.safe_point()
         job.progress(len(entries), len(chosen), f"strip of {views[k].name}")
         done, picture = job.work / f"strip_{k:05d}.json", job.work / f"strip_{k:05d}.png"
         entry = noted(done, dict[str, Any], warn, partial(_check, picture, views[k]))
         if entry is None:
-            stride = stride_for([views[k]], STRIP_RAYS)
-            entry = _write_strip(asset, mesh, load_field(), scene, views[k], stride, picture, job, taken)
+            entry = _write_strip(e, load_field(), views[k], picture)
             rays += entry["width"] * entry["height"]
             note(done, entry, [picture])
         path = EvaluateOutputs(job.out).strip(which)
@@ -66,29 +58,25 @@ def write_strips(
     return entries
 
 
-def _write_strip(
-    asset: EvaluatedAsset, mesh: EvaluatedMesh, field: FieldRenderer, scene: Scene, view: View, stride: int, path: Path, job: Job, taken: Taken | None
-) -> dict[str, Any]:
-    truth = ground_truth(job.inputs[PosesOutputs.stage], view, scene.background)
-    small, shown = subsample_camera(view.camera, stride), partial(as_shown, job, view, taken)
-    truth, seen, tick = truth.subsampled(stride), None, lambda *_: job.safe_point()
-    if is_over_field(asset, scene):
-        seen = field.render(small, progress=tick, box=asset.box, reach=asset.reach)
-    network = shown(field.colour(small, tick) if seen is None else seen.colour, "the field", stride)
-    image = subsample(shown(render_asset(asset, scene, view, seen, stride)[0], "the asset"), stride)
-    drawn = subsample(shown(mesh_image(mesh, asset, scene, view, seen, stride)[0], "the mesh"), stride)
-    renders = {"network": network, "asset": image, "mesh": drawn}
+def _write_strip(e: Evaluation, field: FieldRenderer, view: View, path: Path) -> dict[str, Any]:
+    stride = stride_for([view], STRIP_RAYS)
+    truth, seen = e.truth(view).subsampled(stride), field.colour(subsample_camera(view.camera, stride), lambda *_: e.job.safe_point())
+    renders = {
+        "network": e.shown(view, seen, "the field", stride),
+        "asset": subsample(e.shown(view, e.rendering(view).colour, "the asset"), stride),
+        "mesh": subsample(e.shown(view, mesh_image(e.mesh, view.camera, e.background)[0], "the mesh"), stride),
+    }
     found = {name: {"psnr": truth.psnr(picture), "ssim": truth.ssim(picture)} for name, picture in renders.items()}
-    pictures: list[np.ndarray | None] = [truth.colour, *renders.values()]
     labels = [f"photograph {view.name}", *(f"{name} {quality(found[name])}" for name in renders)]
-    contact_sheet([pictures], [labels], path, thumbnail=max(image.shape[:2]))
-    return {"view": view.name, **found, "width": image.shape[1], "height": image.shape[0]}
+    height, width = truth.colour.shape[:2]
+    contact_sheet([[truth.colour, *renders.values()]], [labels], path, thumbnail=max(height, width))
+    return {"view": view.name, **found, "width": width, "height": height}
 
 
 def _check(picture: Path, view: View, entry: Mapping[str, Any], outputs: Collection[str]) -> None:
     """Raises where this is no strip of the view, or its picture is missing or can't be read."""
-    names = ("network", "asset", "mesh")
-    if entry["view"] != view.name or not all({*FIGURES} <= entry[name].keys() for name in names) or min(entry["width"], entry["height"]) < 1:
+    if entry["view"] != view.name or picture.name not in outputs or min(entry["width"], entry["height"]) < 1:
         raise ValueError("no strip of this view")
-    if picture.name not in outputs or read_png(picture).shape[2] != 3:
-        raise ValueError(f"{picture.name} is missing")
+    for name in ("network", "asset", "mesh"):
+        quality(entry[name])
+    read_png(picture)

@@ -2,7 +2,7 @@
 
 network, asset  means over their views of PSNR (in decibels, as published), SSIM and the rest; `scale`: of the pixel grid
 asset.on_network_views         those of the views that the network was rendered for
-asset_with_network_background  cascade 0 of an unbounded scene's asset between what the field shows before and behind its box; null for other assets
+asset_with_network_background  cascade 0 of an unbounded scene's asset between what the field shows before and behind its box; null in other scenes
 mesh            means over the views of what `stages.evaluate.mesh` measures, and how many faces and texels the mesh has
 splats          the same of the 3D Gaussians (`stages.evaluate.splats`); null where there are none
 gap, holes, floaters and the excess error of both  means over the views that the network was rendered for (`stages.evaluate.comparison`)
@@ -28,7 +28,7 @@ FORMAT = 1
 
 
 def summary(
-    figures: Sequence[dict[str, Any]], *, split: str, stride: int, background: int | None, mesh: Mapping[str, Any], perceptual: Sequence[str] = (),
+    figures: Sequence[dict[str, Any]], *, split: str, stride: int, mesh: Mapping[str, Any], perceptual: Sequence[str] = (),
     strips: Sequence[dict[str, Any]] = (), splats: Mapping[str, Any] | None = None,
     refinement: Mapping[str, int] | None = None, train: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
@@ -36,7 +36,6 @@ def summary(
 
     figures     the metrics of each view
     stride      of the network's renders
-    background  stride of the surroundings that the field renders for the other views; None: no view has such
     mesh        facts about the mesh
     splats      facts about the Gaussians, if there are any
     perceptual  names of LPIPS metrics
@@ -48,8 +47,6 @@ def summary(
     network: dict[str, Any] = {**means(networks), **means(networks, (*perceptual, *SAMPLE_SHARES, "floaters")), "views": len(drawn), "scale": 1.0 / stride}
     asset: dict[str, Any] = {**means(assets), **means(assets, perceptual), "views": len(assets), "scale": 1.0}
     asset["on_network_views"] = means([view["asset"] for view in drawn])
-    if background is not None:
-        asset["background_scale"] = {"network_views": 1.0 / stride, "other_views": 1.0 / background}
     plain = [view["trivial"] for view in figures if view["trivial"] is not None]
     composited = [view["asset_with_network_background"] for view in drawn if view["asset_with_network_background"] is not None]
     return {
@@ -73,7 +70,8 @@ def summary(
 
 def _columns(plain: Sequence[Mapping[str, Any]]) -> list[float]:
     """The mean of each of `blurred`."""
-    return [math.fsum(column) / len(plain) for column in zip(*(view["blurred"] for view in plain), strict=True)]
+    columns = zip(BLURS, *(view["blurred"] for view in plain), strict=True)
+    return [math.fsum(column) / len(plain) for _, *column in columns] if plain else []
 
 
 def means(figures: Sequence[Mapping[str, Any]], names: Sequence[str] = QUALITY) -> dict[str, float | None]:

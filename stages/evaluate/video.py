@@ -12,6 +12,7 @@ from efficientnerf.geometry.cameras import Camera
 from pipeline.stage import Job
 from stages.artifacts import EvaluateOutputs
 from stages.evaluate.asset import EvaluatedAsset
+from stages.evaluate.views import constant_background
 from stages.figures.frames import RenderOptions, encode_frames, render_frames
 from stages.io.png import FAST
 from stages.io.scene import Scene
@@ -25,7 +26,7 @@ def write_captured_path(asset: EvaluatedAsset, tree: NerfTree, scene: Scene, fra
 
     tree  the asset's, whose metadata frames need
     """
-    behind = scene.background or asset.behind
+    behind = constant_background(scene)
 
     def draw(tree: NerfTree, camera: Camera, **more: Any) -> Rendering:
         rendering: Rendering = asset.render(camera, background=behind, **more)

@@ -13,12 +13,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from stages.artifacts import PosesOutputs, inputs_of, needs_of
+from stages.artifacts import PosesOutputs
 from stages.memory.need import MIB, Need
-
-T = TypeVar("T")
 
 MIN_SPACE = MIB // 4  # bytes: logs, plots, manifests, previews of small pictures
 PREVIEWS = 6  # pictures of a stage, as large as a working image
@@ -33,10 +31,6 @@ class Known:
     settings: Mapping[str, Any]  # of each stage by its name, dataclasses
     device: str = "cpu"  # that it computes on
     memory: int | None = None  # bytes that it may take: what does not fit there is written; None: no limit
-
-    def inputs(self, kind: type[T]) -> T:
-        """The inputs of a stage."""
-        return inputs_of(kind, {name: self.run / name for name in needs_of(kind)})
 
     def pictures(self) -> int:
         """Bytes of previews and figures as large as a working image."""

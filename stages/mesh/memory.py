@@ -1,13 +1,14 @@
 """Memory of extracting a surface. docs/experiments/memory.md"""
 
 import math
+from pathlib import Path
 
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.surface.fitting.photometric import MAX_PIXELS
 from efficientnerf.surface.fusion import MARGIN
 from efficientnerf.surface.isosurface import BLOCK, pool_of
 from efficientnerf.surface.volume import VOXELS_AT_ONCE, volume_of
-from stages.artifacts import MeshInputs
+from stages.artifacts import PosesOutputs
 from stages.io.scene import load, views_of
 from stages.memory.forecast import Known
 from stages.memory.need import MIB, SURFACES, Need, libraries
@@ -48,11 +49,11 @@ def surface_needed(tree: NerfTree, texture: int = 0, pixels: int = 0, fitted: in
     return Need(terms | {what: count for what, count in optional.items() if count})
 
 
-def needed(tree: NerfTree, settings: MeshSettings, inputs: MeshInputs) -> Need:
-    """Memory of the stage mesh."""
+def needed(tree: NerfTree, settings: MeshSettings, poses: Path) -> Need:
+    """Memory of the stage mesh; `poses` is the folder of that stage."""
     texture = 0 if settings.texture == "off" else settings.texture_size
     fitted = 0 if settings.photometric_refinement == "off" else _most_faces(tree, settings) // 2
-    pixels = largest_photograph(inputs, "photographs" if fitted else settings.texture)
+    pixels = largest_photograph(poses, "photographs" if fitted else settings.texture)
     return surface_needed(tree, texture=texture, pixels=pixels, fitted=fitted)
 
 
@@ -62,12 +63,12 @@ def _most_faces(tree: NerfTree, settings: MeshSettings) -> int:
 
 def memory_needed(known: Known) -> Need:
     """`needed` for all of the asset."""
-    return needed(asset_of(known), known.settings["mesh"], known.inputs(MeshInputs))
+    return needed(asset_of(known), known.settings["mesh"], PosesOutputs.of_run(known.run).folder)
 
 
 def space_needed(known: Known) -> int:
     """Mesh files, textures and pictures."""
-    own, views = known.settings["mesh"], views_of(load(known.inputs(MeshInputs).poses.folder), "train")
+    own, views = known.settings["mesh"], views_of(load(PosesOutputs.of_run(known.run).folder), "train")
     faces = _most_faces(asset_of(known), own)
     texels = 0 if own.texture == "off" else min(own.texture_size**2, TEXELS * count_pixels(views))
     return SHEET + WRITTEN_FACE * faces + WRITTEN_TEXEL * texels

@@ -11,7 +11,7 @@ from efficientnerf.surface.mesh import Mesh, vertex_normals
 from efficientnerf.surface.nested import SKIPPED
 from efficientnerf.surface.smoothing import FITTED_NORMALS, rounds_of, smooth_normals
 from pipeline.stage import Job
-from stages.artifacts import MeshInputs
+from stages.artifacts import PosesOutputs
 from stages.io.refined_cameras import load_scene
 from stages.io.scene import views_of
 from stages.mesh.settings import MeshSettings
@@ -21,14 +21,15 @@ from stages.reports import CameraVerdict, read_report
 MAX_PHOTOGRAPHS = 64  # photographs, evenly spread over the capture
 
 
-def refined_surface(mesh: Mesh, seen: list[AssetView], inputs: MeshInputs, settings: MeshSettings, job: Job) -> Mesh:
+def refined_surface(mesh: Mesh, seen: list[AssetView], settings: MeshSettings, job: Job) -> Mesh:
     """A mesh of the training frame moved to where photographs agree on it, with the asset's silhouettes again and smoother normals, and facts of that."""
-    views = views_of(load_scene(inputs.poses.folder, inputs.train.folder), "train")
-    cameras = read_report(inputs.poses.verdict, CameraVerdict) if inputs.poses.verdict.is_file() else CameraVerdict()
+    poses, train = job.inputs["poses"], job.inputs["train"]
+    views, verdict = views_of(load_scene(poses, train), "train"), PosesOutputs(poses).verdict
+    cameras = read_report(verdict, CameraVerdict) if verdict.is_file() else CameraVerdict()
     if settings.photometric_refinement == "off" or cameras.grade == "poor":
         return mesh
     chosen = tuple(views[n] for n in np.unique(np.linspace(0, len(views) - 1, min(MAX_PHOTOGRAPHS, len(views))).round().astype(int)))
-    found = refined(mesh.vertices, mesh.faces, photographs(inputs, chosen), job.safe_point)
+    found = refined(mesh.vertices, mesh.faces, photographs(poses, train, chosen), job.safe_point)
     vertices = found.vertices
     if found.improved:
         vertices = fitted_to_silhouettes(vertices, mesh.faces, seen[::SKIPPED], job.safe_point)

@@ -16,7 +16,7 @@ from efficientnerf.surface.nested import scene_surface
 from pipeline.errors import UsageError
 from pipeline.files import write_json
 from pipeline.stage import Job
-from stages.artifacts import MeshInputs, MeshOutputs, inputs_of
+from stages.artifacts import BakeOutputs, MeshOutputs
 from stages.compiling import compiling_kernels
 from stages.figures.shading import IN_FRONT, render_sides
 from stages.formats.exporters import MESH_EXPORTERS
@@ -157,11 +157,11 @@ def write_empty(outputs: MeshOutputs, mesh: Mesh, seen: list[AssetView], frame: 
 
 @compiling_kernels
 def run(job: Job) -> None:
-    outputs, inputs, settings = MeshOutputs(job.out), inputs_of(MeshInputs, job.inputs), job.settings
-    whole = load(inputs.bake.asset)
+    outputs, settings, captured = MeshOutputs(job.out), job.settings, (job.inputs["poses"], job.inputs["train"])
+    whole = load(BakeOutputs(job.inputs["bake"]).asset)
     tree = restricted(whole, settings.region)
     frame = source_frame(tree.metadata)
-    refuse_what_does_not_fit(job, needed(tree, settings, inputs), "Lower bake.max_mib, bake.resolution or mesh.texture_size.")
+    refuse_what_does_not_fit(job, needed(tree, settings, captured[0]), "Lower bake.max_mib, bake.resolution or mesh.texture_size.")
     seen: list[AssetView] = []
     share = 1.0 if settings.texture == "off" else SURFACE_SHARE
     border = whole.region if settings.region == "foreground" else None
@@ -169,10 +169,10 @@ def run(job: Job) -> None:
     if "no_surface" in surface.facts:
         write_empty(outputs, surface, seen, frame, job)
         return
-    surface = refined_surface(surface, seen, inputs, settings, job)
+    surface = refined_surface(surface, seen, settings, job)
     rest = 1 - share
     found = textured(
-        surface, tree, inputs, settings.texture, settings.texture_size, lambda done, total, text: job.reached(share * total + rest * done, total, text)
+        surface, tree, captured, settings.texture, settings.texture_size, lambda done, total, text: job.reached(share * total + rest * done, total, text)
     )
     job.safe_point()
     write_png(preview_of(found, tree.metadata, clipped=border is not None), outputs.preview)

@@ -7,7 +7,6 @@ from msgspec import Meta
 
 from efficientnerf.settings import Auto, Density, Fraction, setting
 from pipeline.stage import ByName, Stage
-from stages.artifacts import MeshInputs, needs_of
 
 
 @dataclass(frozen=True)
@@ -56,4 +55,4 @@ class MeshSettings:
         return int(str(self.max_faces).replace("k", "000"))
 
 
-STAGE = Stage(name="mesh", version=22, settings=MeshSettings, needs=needs_of(MeshInputs), run=ByName("stages.mesh.run:run"))
+STAGE = Stage(name="mesh", version=22, settings=MeshSettings, needs=("bake", "train", "poses"), run=ByName("stages.mesh.run:run"))

@@ -1,6 +1,6 @@
 """Memory of sampling points on a mesh."""
 
-from stages.artifacts import PointsInputs
+from stages.artifacts import MeshOutputs
 from stages.memory.forecast import Known
 from stages.memory.need import SURFACES, Need, libraries
 from stages.mesh.files import mesh_bytes
@@ -16,7 +16,7 @@ def needed(count: int, mesh: int = 0) -> Need:
 
 def memory_needed(known: Known) -> Need:
     """`needed` on the run's mesh."""
-    return needed(known.settings["points"].num_points, mesh_bytes(known.inputs(PointsInputs).mesh))
+    return needed(known.settings["points"].num_points, mesh_bytes(MeshOutputs.of_run(known.run)))
 
 
 def space_needed(known: Known) -> int:

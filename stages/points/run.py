@@ -6,7 +6,7 @@ from efficientnerf.surface.mesh import Mesh, PointCloud, sampled
 from efficientnerf.surface.nested import face_sizes
 from pipeline.errors import StageFailed
 from pipeline.stage import Job
-from stages.artifacts import PointsInputs, PointsOutputs, inputs_of
+from stages.artifacts import BakeOutputs, MeshOutputs, PointsOutputs
 from stages.formats.exporters import POINT_EXPORTERS
 from stages.formats.exporters.writing import SourceFrame, source_frame
 from stages.memory.need import refuse_what_does_not_fit
@@ -24,12 +24,12 @@ def points_of(mesh: Mesh, tree: NerfTree, settings: PointsSettings, frame: Sourc
 
 
 def run(job: Job) -> None:
-    inputs = inputs_of(PointsInputs, job.inputs)
+    mesh_files = MeshOutputs(job.inputs["mesh"])
     remedy = f"Lower points.num_points ({job.settings.num_points}) or mesh.max_faces."
-    refuse_what_does_not_fit(job, needed(job.settings.num_points, mesh_bytes(inputs.mesh)), remedy)
-    tree = outline(inputs.bake.asset)
+    refuse_what_does_not_fit(job, needed(job.settings.num_points, mesh_bytes(mesh_files)), remedy)
+    tree = outline(BakeOutputs(job.inputs["bake"]).asset)
     frame = source_frame(tree.metadata)
-    mesh = read_mesh(inputs.mesh)
+    mesh = read_mesh(mesh_files)
     job.safe_point()
     cloud = points_of(mesh, tree, job.settings, frame)
     job.safe_point()

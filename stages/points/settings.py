@@ -7,7 +7,6 @@ from msgspec import Meta
 
 from efficientnerf.settings import Seed, setting
 from pipeline.stage import ByName, Stage
-from stages.artifacts import PointsInputs, needs_of
 
 
 @dataclass(frozen=True)
@@ -18,4 +17,4 @@ class PointsSettings:
     seed: Seed = setting(0, "Seed of the points' positions on the mesh.", advanced=True)
 
 
-STAGE = Stage(name="points", version=6, settings=PointsSettings, needs=needs_of(PointsInputs), run=ByName("stages.points.run:run"))
+STAGE = Stage(name="points", version=6, settings=PointsSettings, needs=("mesh", "bake"), run=ByName("stages.points.run:run"))

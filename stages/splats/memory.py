@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from efficientnerf.asset.tree import NerfTree
-from stages.artifacts import SplatsInputs
+from stages.artifacts import PosesOutputs, TrainOutputs
 from stages.io.refined_cameras import load_scene
 from stages.io.scene import views_of
 from stages.memory.forecast import Known
@@ -64,14 +64,18 @@ def memory_needed(known: Known) -> Need:
     """`needed` for all of the asset."""
     if known.settings["splats"].make == "off":
         return Need({"libraries": libraries(known.device)})
-    inputs = known.inputs(SplatsInputs)
-    return needed(asset_of(known), known.settings["splats"], (inputs.poses.folder, inputs.train.folder), known.device)
+    return needed(asset_of(known), known.settings["splats"], _captured(known), known.device)
 
 
 def space_needed(known: Known) -> int:
     """Files of the Gaussians, and a picture."""
-    own, inputs = known.settings["splats"], known.inputs(SplatsInputs)
+    own = known.settings["splats"]
     if own.make == "off":
         return 0
-    count = most_gaussians(own, pixels_of(asset_of(known), own, (inputs.poses.folder, inputs.train.folder)))
+    count = most_gaussians(own, pixels_of(asset_of(known), own, _captured(known)))
     return SHEET + (WRITTEN_FLOAT * (3 + parameters_of(own)) + SPZ) * count  # with a normal
+
+
+def _captured(known: Known) -> tuple[Path, Path]:
+    """Folders of the stages poses and train."""
+    return PosesOutputs.of_run(known.run).folder, TrainOutputs.of_run(known.run).folder

@@ -23,7 +23,7 @@ from efficientnerf.splats.refit import PIXELS
 from pipeline.errors import StageFailed, UsageError
 from pipeline.files import write_json
 from pipeline.stage import Job
-from stages.artifacts import PosesOutputs, SplatsInputs, SplatsOutputs, TrainOutputs, inputs_of
+from stages.artifacts import BakeOutputs, SplatsOutputs
 from stages.compiling import compiling_kernels
 from stages.figures.plots import to_uint8
 from stages.formats.exporters import SPLAT_EXPORTERS
@@ -111,8 +111,8 @@ def _on_device(job: Job, tree: NerfTree) -> NerfTree:
 def _make(job: Job, outputs: SplatsOutputs, settings: SplatsSettings) -> None:
     """Raises UsageError where memory is too small, StageFailed where nothing shows."""
     started = time.monotonic()
-    tree = restricted(load(inputs_of(SplatsInputs, job.inputs).bake.asset), settings.region)
-    captured = job.inputs[PosesOutputs.stage], job.inputs[TrainOutputs.stage]
+    tree = restricted(load(BakeOutputs(job.inputs["bake"]).asset), settings.region)
+    captured = job.inputs["poses"], job.inputs["train"]
     remedy = f"Lower splats.count ({settings.count}), poses.max_image_size or bake.max_mib."
     refuse_what_does_not_fit(job, needed(tree, settings, captured, job.device), remedy)
     tree = _on_device(job, tree)

@@ -7,7 +7,6 @@ from msgspec import Meta
 
 from efficientnerf.settings import Auto, Count, Off, Seconds, Seed, setting
 from pipeline.stage import ByName, Stage
-from stages.artifacts import SplatsInputs, needs_of
 
 MAX_COUNT = 5_000_000  # Gaussians: beyond that no program opens them
 
@@ -49,5 +48,5 @@ class SplatsSettings:
 
 
 STAGE = Stage(
-    name="splats", version=13, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=ByName("stages.splats.run:run"), uses_device=True,
+    name="splats", version=13, settings=SplatsSettings, needs=("bake", "train", "poses"), run=ByName("stages.splats.run:run"), uses_device=True,
 )  # fmt: skip

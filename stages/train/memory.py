@@ -10,7 +10,7 @@ from efficientnerf.training.pixels import EXACT, LISTED_SHARE, STRIDE, PixelRows
 from efficientnerf.training.settings import TrainSettings
 from pipeline.executors.memory import size_text
 from pipeline.stage import Job
-from stages.artifacts import PosesOutputs, TrainInputs
+from stages.artifacts import PosesOutputs
 from stages.io.field_file import space_of
 from stages.io.scene import View, load, views_of
 from stages.memory.forecast import Known
@@ -135,7 +135,7 @@ def training_needed(folder: Path, views: tuple[View, ...], settings: TrainSettin
 
 def memory_needed(known: Known) -> Need:
     """Memory of the stage train."""
-    return training_needed(known.inputs(TrainInputs).poses.folder, *_before(known), stored=False, device=known.device)
+    return training_needed(PosesOutputs.of_run(known.run).folder, *_before(known), stored=False, device=known.device)
 
 
 def space_needed(known: Known) -> int:
@@ -150,6 +150,6 @@ def space_needed(known: Known) -> int:
 
 def _before(known: Known) -> tuple[tuple[View, ...], TrainSettings, Space]:
     """Training views, settings without "auto" as for `needed`, and the field's space."""
-    s = load(known.inputs(TrainInputs).poses.folder)
+    s = load(PosesOutputs.of_run(known.run).folder)
     views = views_of(s, "train")
     return views, with_auto_sizes(known.settings["train"], s, count_pixels(views)), space_of(s)

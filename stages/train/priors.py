@@ -49,7 +49,7 @@ def mask_uncovered_cells(m: Model, views: tuple[View, ...], job: Job) -> tuple[P
     if not m.space.contracted and all(view.mask is None for view in views):
         return ()
     job.progress(0, m.settings.iterations, "computing view coverage")
-    folder = job.inputs[PosesOutputs.stage]
+    folder = job.inputs["poses"]
     near, cameras = [view.near for view in views], [view.camera for view in views]
     found = mask_cells_by(m, cameras, near, kept_pixels(folder, views), filled_points(folder, len(views)))
     for prior in found:

@@ -27,7 +27,7 @@ from efficientnerf.training.readback import AsyncOccupancy
 from efficientnerf.training.settings import TrainSettings
 from efficientnerf.training.sparse_depth import SparseDepthRays
 from pipeline.stage import Job
-from stages.artifacts import TrainInputs, TrainOutputs, inputs_of
+from stages.artifacts import TrainOutputs
 from stages.compiling import clock, compiling_kernels
 from stages.cores import use_all_cores
 from stages.io import field_file, refined_cameras, scene
@@ -56,7 +56,7 @@ def trained(job: Job) -> bool:
     began = clock()
 
     use_all_cores()
-    folder, outputs = inputs_of(TrainInputs, job.inputs).poses.folder, TrainOutputs(job.out)
+    folder, outputs = job.inputs["poses"], TrainOutputs(job.out)
     s = (watch := Watch(job, scene.load(folder), folder)).scene
     views = scene.views_of(s, "train")
     settings, space = with_auto_sizes(watch.settings, s, count_pixels(views)), field_file.space_of(s)

@@ -7,7 +7,7 @@ from efficientnerf.settings import resolved
 from efficientnerf.training.settings import TrainSettings
 from pipeline.errors import UsageError
 from pipeline.stage import ByName, Stage
-from stages.artifacts import TrainInputs, TrainOutputs, needs_of
+from stages.artifacts import TrainOutputs
 
 UNBOUNDED = "train.near_plane and train.far_plane are for bounded scenes, and poses.space=contracted makes this one unbounded. Leave them auto."
 
@@ -35,7 +35,7 @@ STAGE = Stage(
     name="train",
     version=16,
     settings=TrainSettings,
-    needs=needs_of(TrainInputs),
+    needs=("poses",),
     run=ByName("stages.train.run:run"),
     uses_device=True,
     check=check,

@@ -10,7 +10,7 @@ from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.settings import resolved
 from pipeline.stage import Job
-from stages.artifacts import TurntableInputs, TurntableOutputs, inputs_of
+from stages.artifacts import BakeOutputs, TurntableOutputs
 from stages.compiling import compiling_kernels
 from stages.figures.frames import RenderOptions, encode_frames, render_frames
 from stages.framing.restriction import restricted
@@ -23,7 +23,7 @@ from stages.turntable.settings import TurntableSettings
 @compiling_kernels
 def run(job: Job) -> None:
     s: TurntableSettings = job.settings
-    whole = format.load(inputs_of(TurntableInputs, job.inputs).bake.asset)
+    whole = format.load(BakeOutputs(job.inputs["bake"]).asset)
     cameras, tree = cameras_of(whole, s, job.warn), restricted(whole, s.region).to(job.device)
     del whole
     remedy = f"Lower turntable.width ({s.width}) or turntable.height ({s.height})."

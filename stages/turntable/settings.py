@@ -7,7 +7,6 @@ from msgspec import Meta
 
 from efficientnerf.settings import Auto, setting
 from pipeline.stage import ByName, Stage
-from stages.artifacts import TurntableInputs, needs_of
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ STAGE = Stage(
     name="turntable",
     version=7,
     settings=TurntableSettings,
-    needs=needs_of(TurntableInputs),
+    needs=("bake",),
     run=ByName("stages.turntable.run:run"),
     uses_device=True,
 )

@@ -21,7 +21,8 @@ from pipeline.errors import CorruptArtifact
 from pipeline.hashes import CHUNK
 from pipeline.manifest import DISTRIBUTION, read_manifest
 from pipeline.run import Run
-from stages.artifacts import BakeOutputs, SplatsInputs, SplatsOutputs, needs_of
+from stages.artifacts import BakeOutputs, SplatsOutputs
+from stages.splats.settings import STAGE as SPLATS
 from stages.viewer.html import MAX_ASSET
 
 VIEWER, ASSET_VIEWER = "viewer.html", "viewer_asset.html"
@@ -136,7 +137,7 @@ def _splats_are_current(run: Run) -> bool:
     """Whether the Gaussians were made of the artifacts that the run holds now."""
     try:
         inputs = read_manifest(run.folder(SplatsOutputs.stage)).request.inputs
-        return all(read_manifest(run.folder(need)).digest == inputs.get(need) for need in needs_of(SplatsInputs))
+        return all(read_manifest(run.folder(need)).digest == inputs.get(need) for need in SPLATS.needs)
     except (CorruptArtifact, OSError):
         return False
 

@@ -26,7 +26,7 @@ from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.training.patches import PatchGrid
 from pipeline.stage import Job
-from stages.artifacts import BakeOutputs, PosesOutputs
+from stages.artifacts import BakeOutputs
 from stages.bake import pruning
 from stages.bake.holes import find_holes
 from stages.bake.memory import needed_on_device
@@ -228,7 +228,7 @@ def _previews(job: Job, s: Scene, point: Point, targets: Targets) -> Previews:
         tree = replace(point.state.tree).to(job.device if targets.on_device else "cpu")
         return render(tree, camera, background=targets.background, normals=False).colour
 
-    return Previews(seen, targets.background, job.inputs[PosesOutputs.stage], s, job.work)
+    return Previews(seen, targets.background, job.inputs["poses"], s, job.work)
 
 
 def _publish(job: Job, log: RefinementLog) -> None:

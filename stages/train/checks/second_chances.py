@@ -18,7 +18,6 @@ from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.settings import TrainSettings
 from efficientnerf.training.sparse_depth import SparseDepthRays
 from pipeline.stage import Job
-from stages.artifacts import PosesOutputs
 from stages.framing.view_coverage import kept_pixels
 from stages.io.field_file import space_of
 from stages.io.scene import Scene, View, views_of
@@ -77,7 +76,7 @@ def _lowers(choices: TrainingChoices, s: Scene) -> bool:
 
 def try_all(job: Job, s: Scene, settings: TrainSettings, pixels: Pixels, held: Sequence[HeldOutView]) -> list[Trial]:
     """A trial of each candidate, in their order."""
-    trials, depth = [], sparse_depth_of(job.inputs[PosesOutputs.stage], s, settings.seed)
+    trials, depth = [], sparse_depth_of(job.inputs["poses"], s, settings.seed)
     for number, (name, choices) in enumerate(candidates(s, settings).items()):
         path = job.work / f"trial_{number}.json"
         trial = noted(path, Trial, job.warn)
@@ -116,7 +115,7 @@ def _train(
     near, far = depth_range(s, own, small)
     m = model(space_of(s), small, s.background, job.device, (near, far))
     begin_sky(m, own)
-    cameras, folder = [view.camera for view in views], job.inputs[PosesOutputs.stage]
+    cameras, folder = [view.camera for view in views], job.inputs["poses"]
     mask_cells_by(m, cameras, own.near.tolist(), kept_pixels(folder, views), filled_points(folder, len(views)))
     exposure = begin_exposure(folder, s, own, small.exposure, job.device)
     for done in loop.train(loop.trainer(m, exposure, cameras=cameras), own, depth):

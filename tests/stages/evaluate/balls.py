@@ -18,11 +18,10 @@ from stages.evaluate.mesh import evaluated_mesh
 from stages.evaluate.run import evaluate
 from stages.evaluate.settings import EvaluateSettings
 from stages.evaluate.splats import EvaluatedSplats
-from stages.figures.plots import to_uint8
 from stages.formats.exporters.frames import frame_from_rendering
 from stages.io.png import write_png
 from stages.io.scene import Scene, View, save
-from tests.fakes import WHITE, BallField, BallTree
+from tests.fakes import WHITE, BallTree
 
 TREE = BallTree()
 WIDTH, HEIGHT = 60, 44
@@ -38,18 +37,15 @@ def ball_mesh(tree: BallTree = TREE, subdivisions: int = 3) -> Mesh:
 BALL_MESH = evaluated_mesh(ball_mesh(), None)
 
 
-def make_scene(folder: Path, splits: str, *, background: tuple[float, float, float] | None = WHITE, masked: bool = False) -> Path:
-    """A poses artifact that photographs TREE: RGBA on a constant background, RGB with the field's surroundings without. One letter of splits per view."""
+def make_scene(folder: Path, splits: str, *, masked: bool = False) -> Path:
+    """A poses artifact that photographs TREE, RGBA on white. One letter of splits per view."""
     (folder / "images").mkdir(parents=True)
     views = []
     for k, letter in enumerate(splits):
         pose = pose_on_sphere((0.0, 0.0, 0.0), 3.0, 30.0 * k, 20.0)
         camera = Camera(f"v{k}.png", WIDTH, HEIGHT, "SIMPLE_PINHOLE", (70.0, WIDTH / 2, HEIGHT / 2), pose)
-        if background is None:
-            frame = to_uint8(BallField(TREE).render(camera).colour)
-        else:
-            seen = TREE.render(camera)
-            frame = frame_from_rendering(seen.colour, seen.opacity, None)
+        seen = TREE.render(camera)
+        frame = frame_from_rendering(seen.colour, seen.opacity, None)
         mask = None
         if masked:
             # The photograph is spoilt where the mask says so.
@@ -62,7 +58,7 @@ def make_scene(folder: Path, splits: str, *, background: tuple[float, float, flo
         write_png(frame, folder / "images" / f"v{k}.png")
         split = {"r": "train", "v": "val", "t": "test"}[letter]
         views.append(View(f"images/v{k}.png", mask, split, camera, camera, 1.0, 5.0))
-    scene = Scene("ball", tuple(views), np.array([[-1.0] * 3, [1.0] * 3]), background, Similarity.identity(), Orbit((0.0, 0.0, 0.0), 3.0, 20.0, False, 0.0))
+    scene = Scene("ball", tuple(views), np.array([[-1.0] * 3, [1.0] * 3]), WHITE, Similarity.identity(), Orbit((0.0, 0.0, 0.0), 3.0, 20.0, False, 0.0))
     save(scene, folder)
     return folder
 
@@ -75,8 +71,8 @@ def job_in(folder: Path, poses: Path, chosen: EvaluateSettings | None = None, ou
     return Job(settings=chosen or settings(), out=folder / out, work=folder / "work", inputs={"poses": poses, "train": folder / "no refined cameras"}, **more)
 
 
-def measure(tree: BallTree, load_field: Callable[[], Any], job: Job, splats: EvaluatedSplats | None = None, **more: Any) -> None:
-    evaluate(tree.evaluated(**more), tree, load_field, job, BALL_MESH, splats)
+def measure(tree: BallTree, load_field: Callable[[], Any], job: Job, splats: EvaluatedSplats | None = None) -> None:
+    evaluate(tree.evaluated(), tree, load_field, job, BALL_MESH, splats)
 
 
 def figures_of(job: Job) -> dict[str, Any]:

@@ -41,7 +41,7 @@ def images(side: int = 70) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("network", ["alex", "vgg"])
 def test_it_is_the_formula(network: str, tmp_path: Path) -> None:
-    metric = load_lpips(network, written(tmp_path / "weights", network), bundled=[])
+    metric = load_lpips(network, written(tmp_path / "weights", network))
     image, truth = images()
     features, heads = made_up(network)
     inputs = [((2 * a - 1 - np.array(SHIFT)) / np.array([0.458, 0.448, 0.450])).transpose(2, 0, 1)[None] for a in (image, truth)]
@@ -70,7 +70,7 @@ def test_damaged_and_wrong_weights_are_refused(tmp_path: Path) -> None:
     folder = Path(written(tmp_path / "weights", "alex"))
     torch.save({"lin0.model.1.weight": torch.zeros(1, 3, 1, 1)}, folder / "alex.pth")
     with pytest.raises(BadInput, match=r"lin0.*expected \(1, 64, 1, 1\)"):
-        load_lpips("alex", str(folder), bundled=[])
+        load_lpips("alex", str(folder))
     (folder / "alex.pth").write_bytes(b"not weights")
     with pytest.raises(BadInput):
-        load_lpips("alex", str(folder), bundled=[])
+        load_lpips("alex", str(folder))

@@ -96,7 +96,6 @@ def test_a_whole_scene_is_rendered_by_itself_and_over_the_network_too(tmp_path: 
     found = figures_of(job)
     assert found["asset"]["psnr"] > 50
     assert found["asset"]["views"] == 3
-    assert "background_scale" not in found["asset"]
     assert found["gap"]["psnr"] == pytest.approx(0.0, abs=1e-3)
     assert found["holes"] == 0.0
     assert found["asset_with_network_background"]["views"] == 2

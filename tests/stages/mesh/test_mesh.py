@@ -15,7 +15,7 @@ from efficientnerf.geometry.orbit import Orbit
 from efficientnerf.surface.mesh import Mesh
 from pipeline.errors import UsageError
 from pipeline.stage import Job
-from stages.artifacts import MeshInputs, MeshOutputs, inputs_of
+from stages.artifacts import MeshOutputs
 from stages.evaluate.mesh import load_mesh
 from stages.io.png import write_png
 from stages.io.scene import Scene, View, load, save
@@ -149,10 +149,9 @@ def test_the_foreground_is_meshed_unless_all_is_asked_for(ball: Path, photograph
 @pytest.mark.parametrize(("choice", "above"), [("auto", (0.2, 0.9, 0.3)), ("asset", (0.9, 0.5, 0.1))])
 def test_the_texture_shows_what_was_asked_for(ball: Path, tmp_path: Path, choice: str, above: tuple[float, ...]) -> None:
     poses = photograph_ball(tmp_path / "poses", ((0.2, 0.9, 0.3), (0.9, 0.1, 0.4)))
-    job = Job(settings=None, inputs=inputs(ball, poses), out=tmp_path / "out", work=tmp_path / "work")
     tree = format.load(ball / "asset.nerftree")
     surface = stage.mesh_of(tree, MeshSettings(max_faces=2000), lambda *each: None)
-    found = textured(surface, tree, inputs_of(MeshInputs, job.inputs), choice, 256, lambda *each: None)
+    found = textured(surface, tree, (poses, poses), choice, 256, lambda *each: None)
     side = len(found.texture.colours)
     u, v = found.texture.coordinates.mean(1).T
     shown = found.texture.colours[((1 - v) * side).astype(int), (u * side).astype(int)] / 255

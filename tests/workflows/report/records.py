@@ -4,7 +4,8 @@ import time
 from pathlib import Path
 
 from pipeline.manifest import NAME, Manifest, Output, Request, read_manifest
-from stages.artifacts import SplatsInputs, SplatsOutputs, needs_of
+from stages.artifacts import SplatsOutputs
+from stages.splats.settings import STAGE as SPLATS
 
 
 def record(run: Path, stage: str, inputs: dict[str, str] | None = None, sha256: str = "0" * 64) -> None:
@@ -17,7 +18,7 @@ def record(run: Path, stage: str, inputs: dict[str, str] | None = None, sha256: 
 
 def record_splats(run: Path) -> None:
     """Write the manifest of Gaussians that are of what the run holds; of inputs without a manifest that, too."""
-    for need in needs_of(SplatsInputs):
+    for need in SPLATS.needs:
         if not (run / need / NAME).exists():
             record(run, need)
-    record(run, SplatsOutputs.stage, {need: read_manifest(run / need).digest for need in needs_of(SplatsInputs)})
+    record(run, SplatsOutputs.stage, {need: read_manifest(run / need).digest for need in SPLATS.needs})
