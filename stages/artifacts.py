@@ -62,7 +62,7 @@ class TrainOutputs(Outputs):
     """The trained field."""
 
     stage = "train"
-    field = Name("field.safetensors")  # stages.io.field_file
+    field = Name("field.safetensors")  # stages.io.field_file: fields, density voxels, the schedule, exposure where it was learned
     cameras = Name("cameras.json")  # training cameras where they changed, and views left out; stages.io.refined_cameras
     choices = Name("choices.json")  # what training did otherwise than scene and settings state, where it learned nothing; stages.train.choices
     wrong_views = Name("wrong_views.png")  # photographs and renders of the views that were left out or got other poses
@@ -77,7 +77,7 @@ class BakeOutputs(Outputs):
 
     stage = "bake"
     asset = Name("asset.nerftree")  # efficientnerf/asset/FORMAT.md
-    report = Name("report.json")  # resolution, voxels, bytes, PSNR before and after the refinement
+    report = Name("report.json")  # resolution and what decided it, voxels, bytes, PSNR before and after the refinement; of an unbounded scene cascades, holes
     log = Name("log.jsonl")  # a line every few steps of the refinement
     curve = Name("curve.png")  # PSNR over these steps
     previews = Name("previews")  # renders of a validation view
@@ -91,14 +91,11 @@ class EvaluateOutputs(Outputs):
     verdict = Name("verdict.json")  # stages.verdict.result: a grade, and problems with cause, remedy and picture
     sparse_points = Name("sparse_points.png")  # points of structure from motion that the asset's depth agrees with or not, of the worst view
     contact_sheet = Name("contact_sheet.png")
-    strip_worst = Name("strip_worst.png")  # photograph, network, asset, mesh; as many of the three as there are views
+    # photograph, network, asset, mesh: strip_WHICH.png, as many of the three as there are views
+    strip_worst = Name("strip_worst.png")
     strip_median = Name("strip_median.png")
     strip_best = Name("strip_best.png")
     captured_path = Name("captured_path.mp4")
-
-    def strip(self, which: str) -> Path:
-        """That of the worst, the median or the best view."""
-        return {"worst": self.strip_worst, "median": self.strip_median, "best": self.strip_best}[which]
 
 
 class TurntableOutputs(Outputs):

@@ -14,14 +14,14 @@ def compiling_kernels(run: Callable[[Job], None]) -> Callable[[Job], None]:
     """A stage's `run` that tells the user when the first kernel is compiled rather than loaded, and in the end how long that took."""
 
     @functools.wraps(run)
-    def telling(job: Job) -> None:
+    def reporting(job: Job) -> None:
         with compilation(lambda: job.say("compiling kernels, once")) as found:
             _compilations.append(found)
             run(job)
         if found.functions:
             job.say(f"compiling kernels, once: {found.seconds:.0f} s", compile_seconds=found.seconds)
 
-    return telling
+    return reporting
 
 
 def clock() -> float:

@@ -9,10 +9,7 @@ import types
 import typing
 from typing import Any
 
-from efficientnerf.settings import setting
 from pipeline.stage import hints_of, limits_of, type_in_words
-
-__all__ = ["SettingInfo", "describe_settings", "setting"]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -248,7 +248,8 @@ def _meshed(export: Export, tree: NerfTree, border: Region | None, frame: Source
     def texture(done: int, total: int, text: str) -> None:
         progress(round(1000 * (share + (1 - share) * done / max(total, 1))), 1000, text)
 
-    return in_capture(textured(mesh_of(tree, wanted, surface, region=border), tree, captured, choice, wanted.texture_size, texture), frame)
+    mesh, _ = mesh_of(tree, wanted, surface, border)
+    return in_capture(textured(mesh, tree, captured, choice, wanted.texture_size, texture), frame)
 
 
 def _write_mesh(export: Export, mesh: Mesh, frame: SourceFrame) -> list[Written]:

@@ -34,6 +34,12 @@ class CapturedPath:
         """(C, 3)."""
         return np.asarray(self.poses[:, :3, 3])
 
+    def cameras(self, scale: float) -> list[Camera]:
+        """Them, with images of this scale."""
+        width, height = (max(1, round(side * scale)) for side in (self.width, self.height))
+        lens = (self.focal * scale, width / 2, height / 2)
+        return [Camera(f"captured_{n:04d}", width, height, "SIMPLE_PINHOLE", lens, pose) for n, pose in enumerate(self.poses)]
+
 
 def captured_metadata(cameras: Sequence[Camera]) -> dict[str, Any]:
     """The metadata `captured_path` of cameras in the training frame, at least one."""

@@ -1,7 +1,6 @@
 """Memory of baking: at most, before it begins; and once its voxels are known. docs/experiments/memory.md"""
 
 from collections.abc import Sequence
-from functools import partial
 
 from efficientnerf.asset.file.serialisation import bytes_per_voxel
 from efficientnerf.asset.refinement.error_map import MAX_CELLS
@@ -9,10 +8,8 @@ from efficientnerf.asset.refinement.fit import PATCH_SIDE
 from efficientnerf.model import Model
 from efficientnerf.rendering.harmonics import harmonics_count
 from efficientnerf.training.pixels import PixelRows, Pixels
-from pipeline.executors.memory import size_text
 from pipeline.stage import Job
-from stages.artifacts import PosesOutputs, TrainOutputs
-from stages.bake.plan import Bake, SceneBake, bake_plan, coarse_cells
+from stages.bake.plan import Bake, bake_plan, coarse_cells
 from stages.bake.settings import BakeSettings
 from stages.bake.voxels import Voxels
 from stages.bake.whole_scene import PAST_SHARE
@@ -21,7 +18,7 @@ from stages.io.field_file import load_renderer
 from stages.io.refined_cameras import load_scene
 from stages.io.scene import View, views_of
 from stages.memory.forecast import Known
-from stages.memory.need import MIB, Need, has_room, libraries, refuse_what_does_not_fit
+from stages.memory.need import MIB, Need, libraries, refuse_what_does_not_fit
 from stages.train.data import channels_of, count_pixels
 from stages.train.memory import DENSITY_VOXEL, PIXELS, parameters, pixels_needed, place_pixels
 from stages.train.pixel_file import PixelFile
@@ -35,13 +32,8 @@ VOXEL, CELL, BRICK_VOXEL, VISIBILITY_RAY, SCENE_RAY, REFINEMENT_RAY = 130, 20, 1
 ERROR_CELL = 48  # bytes of a cell of the error map: two errors, chances, factors and numbers of tiles, and what is made of these
 # Bytes written: of a voxel in a checkpoint besides its values; of a ray, the field's samples of an unbounded scene. Voxels that a visibility ray shows:
 # 4 to 6 were measured. Rays that are refined before a first checkpoint is written.
-WRITTEN, WRITTEN_RAY, SHOWN, SHORT = 24, 700, 8, 20 * 32768
+WRITTEN, WRITTEN_RAY, SHOWN, SHORT = 13, 700, 8, 20 * 32768
 MAX_SHARES = 16  # of the rays, each with the greatest weights of all voxels: efficientnerf.backends.numba.tree.contributions
-
-
-def voxels_needed(voxels: int, harmonics: int, *, packed: bool = False) -> int:
-    """Bytes that density and K harmonics of so many voxels take while they are baked and refined, and `packed`, in float32."""
-    return ((COPIES + PACKED_COPIES * packed) * 4 * (1 + 3 * harmonics) + VOXEL + 4 * min(MAX_SHARES, count_cores())) * voxels
 
 
 def needed_on_device(voxels: int, harmonics: int, bricks: int, cells: int, brick: int, *, smooth: bool) -> int:
@@ -52,23 +44,25 @@ def needed_on_device(voxels: int, harmonics: int, bricks: int, cells: int, brick
 
 
 def needed(
-    settings: BakeSettings, plan: Bake, m: Model, views: Sequence[View], channels: int, *, voxels: int, cells: int, bricks: int, stored: bool, device: str
+    settings: BakeSettings, plan: Bake, m: Model, views: Sequence[View], channels: int, device: str, voxels: int, cells: int | None = None, bricks: int = 0
 ) -> Need:
-    """Memory to bake a model.
+    """Memory to bake a model, with the pixels there.
 
     channels  of the pixels
     voxels    that are baked
-    cells     coarse cells of all grids
-    bricks    that are reached by samples, at most
-    stored    whether the pixels are in a file
+    cells     coarse cells of all grids; None: neither these nor bricks are counted yet
+    bricks    that are reached by samples
     """
-    pixels, harmonics = pixels_needed(views, channels, stored=stored), harmonics_count(plan.degree)
-    rays = _rays(plan, settings, views)
+    if cells is None:
+        cells, bricks = plan.most_cells, min(plan.most_cells, voxels // 8)
+    pixels, harmonics = pixels_needed(views, channels), harmonics_count(plan.degree)
+    rays, copies = _rays(plan, settings, views), COPIES + PACKED_COPIES * (plan.layout == "packed")
+    of_a_voxel = copies * 4 * (1 + 3 * harmonics) + VOXEL + 4 * min(MAX_SHARES, count_cores())
     return Need({
         PIXELS: pixels[PIXELS],
-        "voxels": max(voxels_needed(voxels, harmonics, packed=plan.layout == "packed"), pixels["reading images"] + pixels["directions of pixels"]),
+        "voxels": max(of_a_voxel * voxels, pixels["reading images"] + pixels["directions of pixels"]),
         "the grid": CELL * cells + BRICK_VOXEL * plan.brick_size**3 * bricks,
-        "rays": (SCENE_RAY if isinstance(plan, SceneBake) else VISIBILITY_RAY) * rays + REFINEMENT_RAY * settings.refine_rays_per_batch,
+        "rays": (SCENE_RAY if plan.kind == "scene" else VISIBILITY_RAY) * rays + REFINEMENT_RAY * settings.refine_rays_per_batch,
         "the error map": ERROR_CELL * min(MAX_CELLS, count_pixels(tuple(views)) // PATCH_SIDE),
         "the field": 3 * 4 * parameters(m.settings) + DENSITY_VOXEL * m.voxels.side**3 // 4,
         "libraries": libraries(device),
@@ -78,13 +72,7 @@ def needed(
 def _rays(plan: Bake, settings: BakeSettings, views: Sequence[View]) -> int:
     """That voxels are chosen by."""
     count = min(settings.visibility_rays, count_pixels(tuple(views)))
-    return count + isinstance(plan, SceneBake) * int(PAST_SHARE * count)
-
-
-def most_needed(settings: BakeSettings, plan: Bake, m: Model, views: Sequence[View], channels: int, voxels: int, *, stored: bool, device: str) -> Need:
-    """Memory to bake at most so many voxels, before they are counted."""
-    bricks = min(plan.most_cells, voxels // 8)
-    return needed(settings, plan, m, views, channels, voxels=voxels, cells=plan.most_cells, bricks=bricks, stored=stored, device=device)
+    return count + (plan.kind == "scene") * int(PAST_SHARE * count)
 
 
 def rows_for_baking(job: Job, plan: Bake, m: Model, views: tuple[View, ...]) -> PixelRows | None:
@@ -93,15 +81,10 @@ def rows_for_baking(job: Job, plan: Bake, m: Model, views: tuple[View, ...]) -> 
     The number of voxels is not known yet: what would not fit without any is refused here, and the rest by `refuse_more_than_fits`, before voxels are baked.
     """
     settings, channels = job.settings, channels_of(job.inputs["poses"], views)
-    at_most = partial(most_needed, settings, plan, m, views, channels, device=job.device)
-    stored = not has_room(job, at_most(plan.most_voxels, stored=False))
+    most, least = (needed(settings, plan, m, views, channels, job.device, voxels) for voxels in (plan.most_voxels, 0))
     finest = plan.resolution.resolution
     remedy = f"Lower bake.max_resolution ({finest} voxels), bake.visibility_rays ({settings.visibility_rays}) or poses.max_image_size."
-    rows = place_pixels(job, at_most(0, stored=stored), views, channels, remedy, stored=stored)
-    if job.memory is not None and (most := at_most(plan.most_voxels, stored=stored).total) > job.memory.bytes:
-        job.warn(f"an asset of {plan.mib:g} MiB may need {size_text(most)} of memory; the limit is {size_text(job.memory.bytes)}. If it does not fit,"
-                 " it is refused after its voxels are counted, before they are baked. Lower bake.max_mib to be sure.")  # fmt: skip
-    return rows
+    return place_pixels(job, most, least, views, channels, remedy)
 
 
 def refuse_more_than_fits(job: Job, plan: Bake, m: Model, views: tuple[View, ...], pixels: Pixels, voxels: Voxels) -> None:
@@ -109,9 +92,9 @@ def refuse_more_than_fits(job: Job, plan: Bake, m: Model, views: tuple[View, ...
 
     pixels  as they were placed
     """
-    grid = {"voxels": voxels.count, "cells": coarse_cells(voxels.grids), "bricks": voxels.bricks}
-    stored = isinstance(pixels.images, PixelFile)
-    need = needed(job.settings, plan, m, views, pixels.images.shape[1], **grid, stored=stored, device=job.device)
+    need = needed(job.settings, plan, m, views, pixels.images.shape[1], job.device, voxels.count, coarse_cells(voxels.grids), voxels.bricks)
+    if isinstance(pixels.images, PixelFile):
+        need = need.without(PIXELS, pixels.images.nbytes)
     many = f"{voxels.count:,} voxels with {harmonics_count(plan.degree)} harmonics are too many"
     refuse_what_does_not_fit(job, need, f"Lower bake.max_mib ({plan.mib:g}) or bake.resolution ({voxels.choice.resolution}): {many}.")
 
@@ -119,8 +102,8 @@ def refuse_more_than_fits(job: Job, plan: Bake, m: Model, views: tuple[View, ...
 def memory_needed(known: Known) -> Need:
     """Most memory of the stage bake, before its voxels are counted."""
     plan, m, views = _before(known)
-    channels = channels_of(PosesOutputs.of_run(known.run).folder, views)
-    return most_needed(known.settings["bake"], plan, m, views, channels, plan.most_voxels, stored=False, device=known.device)
+    channels = channels_of(known.run / "poses", views)
+    return needed(known.settings["bake"], plan, m, views, channels, known.device, plan.most_voxels)
 
 
 def space_needed(known: Known) -> int:
@@ -130,11 +113,11 @@ def space_needed(known: Known) -> int:
     values, voxels = 4 * (1 + 3 * harmonics_count(plan.degree)), min(plan.most_voxels, SHOWN * rays)
     checkpoints = 1 if plan.refine_steps is not None and plan.refine_steps * own.refine_rays_per_batch < SHORT else 2
     asset = min(int(plan.mib * MIB), 2 * bytes_per_voxel(plan.layout, plan.degree) * voxels)
-    return (values + checkpoints * (values + WRITTEN)) * voxels + asset + isinstance(plan, SceneBake) * WRITTEN_RAY * rays + known.pictures()
+    return (values + checkpoints * (values + WRITTEN)) * voxels + asset + (plan.kind == "scene") * WRITTEN_RAY * rays + known.pictures()
 
 
 def _before(known: Known) -> tuple[Bake, Model, tuple[View, ...]]:
     """The plan, the model and the training views."""
-    poses, train = PosesOutputs.of_run(known.run).folder, TrainOutputs.of_run(known.run).folder
+    poses, train = known.run / "poses", known.run / "train"
     m, s = load_renderer(train).model, load_scene(poses, train)
     return bake_plan(known.settings["bake"], m, s, known.device, count_cores()), m, views_of(s, "train")

@@ -31,7 +31,7 @@ def metadata_of(s: Scene, settings: BakeSettings, m: Model) -> dict[str, Any]:
         "orbit": asdict(s.orbit),
         "captured_path": captured_metadata([view.camera for view in s.views]),
         "metric": bool(s.metric),
-        **({} if s.forward is None else {"spiral": spiral_of(s.forward)}),
+        **({} if s.forward is None else {"spiral": _spiral_of(s.forward)}),
         "licence": settings.licence,
         "provenance": {
             "tool": f"efficientnerf {tool}",
@@ -42,7 +42,7 @@ def metadata_of(s: Scene, settings: BakeSettings, m: Model) -> dict[str, Any]:
     }
 
 
-def spiral_of(forward: ForwardFacing) -> dict[str, Any]:
+def _spiral_of(forward: ForwardFacing) -> dict[str, Any]:
     """The parameters of a camera path for a forward-facing scene."""
     return {
         "radii": [float(x) for x in forward.radii],

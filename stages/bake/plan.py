@@ -1,8 +1,8 @@
-"""What is decided before an asset is baked: `bake_plan` resolves settings, field and scene to numbers, as one of three types.
+"""What is decided before an asset is baked: `bake_plan` resolves settings, field and scene to numbers, of one of three kinds.
 
-    ObjectBake  one grid over the field's box, before a constant background
-    SceneBake   nested grids around a foreground region, and an environment map: an unbounded scene
-    NdcBake     one grid in normalised device coordinates: a forward-facing scene
+    object  one grid over the field's box, before a constant background
+    scene   nested grids around a foreground region, and an environment map: an unbounded scene
+    ndc     one grid in normalised device coordinates: a forward-facing scene
 
 What comes after takes this plan, and compares no setting with "auto".
 """
@@ -10,6 +10,7 @@ What comes after takes this plan, and compares no setting with "auto".
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -37,8 +38,9 @@ def coarse_cells(grids: Sequence[Grid]) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class _Bake:
+class Bake:
     """
+    kind               see the module
     space              the field's, in the frame that the voxels are cubes of
     background         constant sRGB colour that the asset is composited with; None: its environment map
     resolution         voxels along the longest side: those stated, or the most in question; of a scene an estimate until its foreground region is known
@@ -59,8 +61,13 @@ class _Bake:
     seconds            of the stage, in place of steps; None: it may take any time
     view_dependent_lr_ratio, error_map
                        of the refinement
+    box                of a scene: (2, 3) that the innermost grid covers where the field was trained on voxels, whose corner is one of theirs; None: the
+                       foreground region's
+    cascades           of a scene: how many nested grids there are, at least and at most
+    max_resolution     stated; None: as many as MAX_CELLS of all grids allow
     """
 
+    kind: Literal["object", "scene", "ndc"]
     space: Space
     background: tuple[float, float, float] | None
     resolution: Choice
@@ -82,6 +89,9 @@ class _Bake:
     seconds: float | None
     view_dependent_lr_ratio: float
     error_map: float
+    box: np.ndarray | None
+    cascades: tuple[int, int]
+    max_resolution: int | None
 
     @property
     def least(self) -> int:
@@ -97,33 +107,6 @@ class _Bake:
     def most_voxels(self) -> int:
         """Voxels that are baked at most."""
         return min(MAX_OVERSHOOT * self.capacity(1), self.most_cells * self.brick_size**3)
-
-
-@dataclass(frozen=True, eq=False)
-class ObjectBake(_Bake):
-    """A bounded scene before a constant background."""
-
-
-@dataclass(frozen=True, eq=False)
-class NdcBake(_Bake):
-    """A forward-facing scene."""
-
-
-@dataclass(frozen=True, eq=False)
-class SceneBake(_Bake):
-    """An unbounded scene.
-
-    box             (2, 3) that the innermost grid covers where the field was trained on voxels, whose corner is one of theirs; None: the foreground region's
-    cascades        how many nested grids there are, at least and at most
-    max_resolution  stated; None: as many as MAX_CELLS of all grids allow
-    """
-
-    box: np.ndarray | None
-    cascades: tuple[int, int]
-    max_resolution: int | None
-
-
-Bake = ObjectBake | SceneBake | NdcBake
 
 
 def bake_plan(settings: BakeSettings, m: Model, s: Scene, device: str, cores: int) -> Bake:
@@ -158,7 +141,8 @@ def bake_plan(settings: BakeSettings, m: Model, s: Scene, device: str, cores: in
         ratio = of_views if s.background is None else 1.0
     if error_map is None:
         error_map = ERROR_MAP if s.forward is None else 0.0
-    common = _Bake(
+    return Bake(
+        kind="scene" if whole else "object" if s.forward is None else "ndc",
         space=space, background=background, resolution=resolution, fixed=bool(side), least_cells=least_cells, most_cells=most_cells,
         at_centres=trained is not None and trained == side and space is m.space,
         min_views=resolved(m.settings.min_views) or 0 if m.space.contracted else 0,
@@ -166,10 +150,8 @@ def bake_plan(settings: BakeSettings, m: Model, s: Scene, device: str, cores: in
         degree=m.fine.degree, layout=settings.layout, brick_size=brick, environment_size=settings.environment_size if whole else 0,
         min_component=settings.min_component if s.background is None else 0.0,
         refine_steps=resolved(settings.refine_steps) if seconds is None else None, seconds=seconds, view_dependent_lr_ratio=ratio, error_map=error_map,
+        box=np.asarray(m.space.bounds, np.float64) if trained else None, cascades=cascades, max_resolution=max_resolution,
     )  # fmt: skip
-    if whole:
-        return SceneBake(**vars(common), box=np.asarray(m.space.bounds, np.float64) if trained else None, cascades=cascades, max_resolution=max_resolution)
-    return ObjectBake(**vars(common)) if s.forward is None else NdcBake(**vars(common))
 
 
 def _space(settings: BakeSettings, m: Model) -> Space:

@@ -18,13 +18,13 @@ from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.tree import NerfTree
 from pipeline.stage import Job
 from stages.bake.holes import find_holes, voxels_of_holes
-from stages.bake.plan import Bake, NdcBake, ObjectBake, SceneBake
+from stages.bake.plan import Bake
 from stages.bake.voxels import FEW_VIEWS_RATIO, seen_by_few
 from stages.io.scene import Scene
 
 # Training rays per voxel that are rendered to see which voxels show, at least bake.visibility_rays: fewer where many of the voxels that are baked do not stay,
 # and in normalised device coordinates, where no ray misses and each meets many voxels. docs/experiments/refinement.md
-RAYS_PER_VOXEL = {ObjectBake: 1.0, SceneBake: 0.4, NdcBake: 0.25}
+RAYS_PER_VOXEL = {"object": 1.0, "scene": 0.4, "ndc": 0.25}
 
 
 @dataclass(frozen=True)
@@ -45,22 +45,23 @@ class Pruned:
 
 def prune(
     job: Job, s: Scene, plan: Bake, state: RefinementState, targets: Targets, most: int, samples: FieldSamples | None = None, baked: np.ndarray | None = None
-) -> tuple[RefinementState, Pruned]:
+) -> tuple[RefinementState, Pruned, np.ndarray]:
     """Only the voxels that contribute more than bake.weight_threshold to a pixel, and of these at most `most`, those that contribute most. In an unbounded
-    scene, voxels stay without which a ray would end in a hole. In normalised device coordinates voxels that few images have in view count more.
+    scene, voxels stay without which a ray would end in a hole. In normalised device coordinates voxels that few images have in view count more. Returned are
+    the state, how voxels were dropped, and (N,) bool, which were not.
 
     samples, baked  of an unbounded scene: of its field, and (N,) densities before the first step
     """
     state.to_host()
     greatest = greatest_weights(job, plan, state, targets)
-    if isinstance(plan, NdcBake):
+    if plan.kind == "ndc":
         greatest[of_few_views(job, s, state.tree)] *= FEW_VIEWS_RATIO
     keep = heaviest(job, greatest, most)
     if not keep.any():
-        return state, Pruned()
+        return state, Pruned(), ~keep
     if samples is None:
         keep &= ~small_components(state.tree, keep, plan.min_component)
-        return subset_state(state, keep, subset(state.tree, keep)), Pruned()
+        return subset_state(state, keep, subset(state.tree, keep)), Pruned(), keep
 
     assert baked is not None
     keep &= ~unsupported_components(state.tree, keep, plan.min_component, samples)
@@ -74,12 +75,13 @@ def prune(
         others = np.flatnonzero(keep & ~restored)
         keep[others[np.argsort(greatest[others], kind="stable")[:over]]] = False
     tree = subset(state.tree, keep)
-    return subset_state(state, keep, tree), Pruned(pruned_share, find_holes(job, tree, samples)[1], int((restored & keep).sum()))
+    pruned = Pruned(pruned_share, find_holes(job, tree, samples)[1], int((restored & keep).sum()))
+    return subset_state(state, keep, tree), pruned, keep
 
 
 def count_rays(job: Job, plan: Bake, voxels: int, targets: Targets) -> int:
     """Training rays that are rendered to find which of so many voxels show."""
-    return min(max(job.settings.visibility_rays, int(RAYS_PER_VOXEL[type(plan)] * voxels)), 4 * len(targets.pixels))
+    return min(max(job.settings.visibility_rays, int(RAYS_PER_VOXEL[plan.kind] * voxels)), 4 * len(targets.pixels))
 
 
 def greatest_weights(job: Job, plan: Bake, state: RefinementState, targets: Targets) -> np.ndarray:

@@ -115,11 +115,11 @@ def ndc_pixel(s: Scene, forward: ForwardFacing) -> float:
     return forward.ndc.slopes[0] / float(np.median([view.camera.intrinsics["fx"] for view in s.views]))
 
 
-def affordable_resolution(finest: Choice, count: Callable[[int], int], room: Callable[[int], int]) -> Choice:
+def affordable_resolution(finest: Choice, count: Callable[[int], int], capacity: Callable[[int], int]) -> Choice:
     """The greatest resolution up to the finest at which about as many voxels are baked as the asset holds.
 
-    count  voxels that would be baked at a resolution
-    room   voxels that the asset holds
+    count     voxels that would be baked at a resolution
+    capacity  voxels that the asset holds
     """
     top = finest.resolution
     low, high = (max(MIN_RESOLUTION, top // n) for n in (4, 2))
@@ -127,15 +127,15 @@ def affordable_resolution(finest: Choice, count: Callable[[int], int], room: Cal
     power = float(np.clip(math.log(max(more, 1) / max(few, 1)) / math.log(high / low), 1.5, 3)) if high > low else 2.0
 
     def scaled(at: int, voxels: int) -> int:
-        return int(np.clip(int(at * (0.5 * (1 + MIN_FILL) * room(at) / max(voxels, 1)) ** (1 / power)), MIN_RESOLUTION, top))
+        return int(np.clip(int(at * (0.5 * (1 + MIN_FILL) * capacity(at) / max(voxels, 1)) ** (1 / power)), MIN_RESOLUTION, top))
 
-    at = top if more * (top / high) ** power <= 1.2 * room(top) else scaled(high, more)
+    at = top if more * (top / high) ** power <= 1.2 * capacity(top) else scaled(high, more)
     best = 0
     for _ in range(MAX_TRIES):
         voxels = count(at)
-        if voxels <= room(at):
+        if voxels <= capacity(at):
             best = max(best, at)
-            if at == top or voxels >= MIN_FILL * room(at):
+            if at == top or voxels >= MIN_FILL * capacity(at):
                 break
         following = scaled(at, voxels)
         if following in (at, best):

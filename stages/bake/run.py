@@ -1,12 +1,4 @@
-"""The bake stage: a trained field in, the asset out.
-
-    asset.nerftree  see efficientnerf/asset/FORMAT.md
-    report.json     resolution and what decided it, voxels, bytes; PSNR of a sample of the training pixels before and after the refinement, and of a packed
-                    asset as it is written; of a scene without a constant background, baked as unbounded (`stages.bake.whole_scene`): its cascades, and
-                    the share of the rays that end in holes
-    log.jsonl       a line every few steps of the refinement
-    curve.png       PSNR over these steps
-    previews/       renders of a validation view
+"""The bake stage: a trained field in, the asset out, and what `stages.artifacts.BakeOutputs` lists.
 
 The scratch folder keeps what takes long: the visibility of the voxels or the field's samples, each block of baked values, and the state of the refinement.
 """
@@ -27,7 +19,7 @@ from stages.artifacts import BakeOutputs
 from stages.bake.economy import packed_tree
 from stages.bake.memory import refuse_more_than_fits, rows_for_baking
 from stages.bake.metadata import metadata_of, sources_of
-from stages.bake.plan import Bake, SceneBake, bake_plan, unused_settings
+from stages.bake.plan import Bake, bake_plan, unused_settings
 from stages.bake.refine.refinement import refined
 from stages.bake.refine.timing import Stopwatch
 from stages.bake.settings import refuse_nerf
@@ -96,6 +88,6 @@ def write_report(outputs: BakeOutputs, plan: Bake, voxels: Voxels, tree: NerfTre
     found: dict[str, Any] = {"resolution": list(tree.resolution), "voxels": len(tree.density_values), "bricks": len(tree.voxel_index)}
     found |= {"bytes": outputs.asset.stat().st_size, "optimisation": refinement}
     found |= {"voxels_along_longest_side": voxels.choice.resolution, "resolution_decided_by": voxels.choice.why, "max_mib": plan.max_mib}
-    if isinstance(plan, SceneBake):
+    if plan.kind == "scene":
         found |= {"cascades": np.bincount(voxel_cascades(tree), minlength=len(voxels.grids)).tolist(), "voxel": tree.voxel}
     outputs.report.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n", encoding="utf-8")

@@ -17,11 +17,11 @@ from efficientnerf.model import Model
 from efficientnerf.training.pixels import Pixels
 from pipeline.errors import StageFailed, UsageError
 from pipeline.stage import Job
-from stages.bake.plan import Bake, SceneBake, coarse_cells, grid_over
+from stages.bake.plan import Bake, coarse_cells, grid_over
 from stages.bake.resolution import MAX_OVERSHOOT, MIN_RESOLUTION, OVERSHOOT, Choice, affordable_resolution
 from stages.bake.scratch import rendered_once
 from stages.bake.settings import BakeSettings
-from stages.bake.whole_scene import CENTRES_PER_BLOCK, Cascades, Surroundings, boxes_of
+from stages.bake.whole_scene import Cascades, Surroundings, boxes_of, kept_by
 from stages.framing.view_coverage import count_views, has_min_views, kept_pixels
 from stages.io import scene
 from stages.io.scene import Scene
@@ -56,7 +56,7 @@ def choose_voxels(job: Job, plan: Bake, m: Model, s: Scene, pixels: Pixels) -> V
     """The resolution, and the voxels that training images show: the heaviest where these are more than the asset holds. StageFailed where there are none."""
     settings: BakeSettings = job.settings
     refuse_without_capacity(plan, plan.least_cells)
-    shown = Cascades(job, plan, m, s, pixels) if isinstance(plan, SceneBake) else OneGrid(job, plan, m, s, pixels)
+    shown = Cascades(job, plan, m, s, pixels) if plan.kind == "scene" else OneGrid(job, plan, m, s, pixels)
     refuse_without_capacity(plan, coarse_cells(shown.grids(plan.least)))
     last: tuple[int, list[Grid], list[Visibility], list[np.ndarray]] | None = None
 
@@ -85,7 +85,7 @@ def choose_voxels(job: Job, plan: Bake, m: Model, s: Scene, pixels: Pixels) -> V
     if not voxels.count:
         found = "no voxel of the box contributes to any training image"
         raise StageFailed(f"bake: the trained field is empty: {found}. Train longer, or check the box (poses.crop_box).")
-    of = f" of {len(grids)} cascades" if isinstance(plan, SceneBake) else ""
+    of = f" of {len(grids)} cascades" if plan.kind == "scene" else ""
     job.say(f"{choice.resolution} voxels along the longest side ({choice.why}); {voxels.count:,} voxels{of} are baked")
     return voxels
 
@@ -126,9 +126,7 @@ class OneGrid:
         if not self.plan.min_views:
             return indices
         cameras = [view.camera for view in scene.views_of(self.s, "train")]
-        parts = (indices[at : at + CENTRES_PER_BLOCK] for at in range(0, len(indices), CENTRES_PER_BLOCK))
-        keep = [has_min_views((part + 0.5) * grid[1] + grid[2], cameras, self.plan.min_views) for part in parts]
-        return indices[np.concatenate(keep)] if keep else indices
+        return kept_by(lambda centres: has_min_views(centres, cameras, self.plan.min_views), indices, grid)
 
     def surroundings(self, grids: list[Grid], seen: list[Visibility], indices: list[np.ndarray]) -> None:
         """None: nothing lies around the box."""

@@ -1,13 +1,13 @@
 """The cascades of an unbounded scene and their voxels, its foreground region, and its environment map.
 
 The field is rendered along training rays once (`efficientnerf.asset.field_samples`), and along rays past the borders of their images. The training rays' end
-points give the foreground region, which the innermost
-cascade covers; the cascades around it hold nearly all that the photographs show, and the rest goes to the environment map.
+points give the foreground region, which the innermost cascade covers; the cascades around it hold nearly all that the photographs show, and the rest goes to
+the environment map.
 
 N voxels, P rays.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,7 +31,7 @@ from efficientnerf.model import Model
 from efficientnerf.training.pixels import Pixels
 from pipeline.stage import Job
 from stages.bake.holes import END_WEIGHT
-from stages.bake.plan import SceneBake, nested_grids
+from stages.bake.plan import Bake, nested_grids
 from stages.bake.resolution import MAX_BEYOND, finest_of_cascades
 from stages.bake.scratch import rendered_once
 from stages.framing.view_coverage import MAX_CONTRADICTED, close_to_path, kept_pixels, poorly_seen
@@ -79,7 +79,7 @@ class Surroundings:
 class Cascades:
     """The nested grids around the foreground region, and what the field's samples show of their voxels."""
 
-    def __init__(self, job: Job, plan: SceneBake, m: Model, s: Scene, pixels: Pixels) -> None:
+    def __init__(self, job: Job, plan: Bake, m: Model, s: Scene, pixels: Pixels) -> None:
         self.job, self.plan, self.s, self.pixels = job, plan, s, pixels
         own = job.settings
         self.samples = rendered_once(
@@ -107,9 +107,9 @@ class Cascades:
         brick, threshold = self.plan.brick_size, END_WEIGHT
         past = cascade_visibility(self.samples.past_borders, grids, brick, END_WEIGHT)
         weights = np.sort(np.concatenate([one.greatest[one.greatest > END_WEIGHT] for one in past]))
-        room = max(0, most - sum(map(len, indices)))
-        if len(weights) > room:
-            threshold = float(weights[-room - 1])
+        left = max(0, most - sum(map(len, indices)))
+        if len(weights) > left:
+            threshold = float(weights[-left - 1])
         ends = [chosen_voxels(one, shape, brick, threshold, 0) for one, (shape, _, _) in zip(past, grids, strict=True)]
         both = [_union(one, other, shape, brick) for one, other, (shape, _, _) in zip(indices, ends, grids, strict=True)]
         return cascade_visibility(self.samples, grids, brick, self.job.settings.weight_threshold), both
@@ -120,16 +120,15 @@ class Cascades:
         masks, filled = kept_pixels(poses, views), filled_points(poses, len(views))
         cameras, near = [view.camera for view in views], [view.near for view in views]
         refuted = filled is not None and len(filled) > 0 and close_to_path(filled, cameras, near, BAKED_CLEARANCE, filled).mean() > MAX_CONTRADICTED
-        _, voxel, low = grid
-        kept = []
-        for at in range(0, len(indices), CENTRES_PER_BLOCK):
+
+        def keep(centres: np.ndarray) -> np.ndarray:
             self.job.safe_point()
-            centre = (indices[at : at + CENTRES_PER_BLOCK] + 0.5) * voxel + low
-            keep = np.ones(len(centre), bool) if refuted else ~close_to_path(centre, cameras, near, BAKED_CLEARANCE, filled)
+            kept = np.ones(len(centres), bool) if refuted else ~close_to_path(centres, cameras, near, BAKED_CLEARANCE, filled)
             if self.plan.min_views:
-                keep[keep] = ~poorly_seen(centre[keep], self.plan.space.bounds, cameras, self.plan.min_views, masks)
-            kept.append(keep)
-        return indices[np.concatenate(kept)] if kept else indices
+                kept[kept] = ~poorly_seen(centres[kept], self.plan.space.bounds, cameras, self.plan.min_views, masks)
+            return kept
+
+        return kept_by(keep, indices, grid)
 
     def surroundings(self, grids: list[Grid], seen: list[Visibility], indices: list[np.ndarray]) -> Surroundings:
         """What is baked besides these voxels."""
@@ -139,6 +138,14 @@ class Cascades:
         environment = environment_beyond(samples, boxes_of(grids, brick), self.plan.environment_size, mean)
         weights = [seen_weights(one, part, shape, brick) for one, part, (shape, _, _) in zip(seen, indices, grids, strict=True)]
         return Surroundings(samples, self.region, weights, environment)
+
+
+def kept_by(keep: Callable[[np.ndarray], np.ndarray], indices: np.ndarray, grid: Grid) -> np.ndarray:
+    """The voxels (N, 3) of a grid whose centres (n, 3), some at a time, are kept."""
+    _, voxel, low = grid
+    parts = (indices[at : at + CENTRES_PER_BLOCK] for at in range(0, len(indices), CENTRES_PER_BLOCK))
+    kept = [part[keep((part + 0.5) * voxel + low)] for part in parts]
+    return np.concatenate(kept) if kept else indices
 
 
 def _union(one: np.ndarray, other: np.ndarray, shape: tuple[int, int, int], brick: int) -> np.ndarray:
@@ -181,8 +188,6 @@ def region_of(samples: FieldSamples, pixels: Pixels, s: Scene, poses: Path) -> R
     place = picture_places(samples, pixels, every)
     found = find_subject(surface_points(samples)[every], samples.view[every], place, cameras, weights=samples.opacity[every])
     return Region(np.asarray(s.bounds, np.float64)) if found is None else found.region
-
-
 
 
 def fits(samples: FieldSamples, pixels: Pixels) -> bool:

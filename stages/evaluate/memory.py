@@ -7,7 +7,7 @@ from pathlib import Path
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.settings import resolved
 from efficientnerf.surface.shading import AT_ONCE
-from stages.artifacts import MeshOutputs, PosesOutputs, TrainOutputs
+from stages.artifacts import MeshOutputs, TrainOutputs
 from stages.evaluate.settings import MAX_FIELD_IMAGE_SIZE, STAGE, EvaluateSettings
 from stages.evaluate.strips import STRIP_RAYS
 from stages.evaluate.views import evaluation_views
@@ -53,6 +53,6 @@ def memory_needed(known: Known) -> Need:
 def space_needed(known: Known) -> int:
     """Strips, thumbnails in scratch and on a sheet, and a video."""
     own = known.settings["evaluate"]
-    pixels = [view.camera.width * view.camera.height for view in evaluation_views(load(PosesOutputs.of_run(known.run).folder))[0]]
+    pixels = [view.camera.width * view.camera.height for view in evaluation_views(load(known.run / "poses"))[0]]
     strips, thumbnails = STRIPS * max(pixels), sum(min(each, THUMBNAIL) for each in pixels)
     return SHEET + WRITTEN * (strips + PICTURES * thumbnails) + (resolved(own.captured_path_frames) or 0) * max(pixels) // 4

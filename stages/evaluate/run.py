@@ -1,13 +1,7 @@
 """The evaluate stage: PSNR, SSIM and optionally LPIPS of the trained field, the baked asset, the mesh and the 3D Gaussians on the test views, and what parts
 the first two.
 
-    verdict.json       a grade, and for each problem its cause, what to do and the picture that shows it (stages.verdict.result)
-    sparse_points.png  where the asset's depth agrees with the sparse points, of the view where it does least (stages.evaluate.sparse_points)
-    metrics.json       "network" (the field), "asset", "mesh" and, where there are Gaussians, "splats": means over the views; "gap", "holes", "floaters": the
-                       asset against the network; "views": the metrics of each (stages.evaluate.summary, .comparison, .mesh, .splats)
-    contact_sheet.png  ground truth, field and asset, with their errors
-    strip_*.png        photograph, network, asset and mesh at full size: the worst, the median and the best view
-    captured_path.mp4  the asset along the captured cameras
+Its files are those of `stages.artifacts.EvaluateOutputs`; metrics.json is described in `stages.evaluate.summary`.
 
 The field is slow to render. Only some views are rendered with it, and of these every n-th pixel along each side, through the pixel's own centre: the
 PSNR is an unbiased estimate of that at full size, which a comparison with downscaled photographs would not be. (SSIM is that of the subsampled
@@ -102,12 +96,14 @@ def evaluate(
     for k, view in enumerate(views):
         job.safe_point()
         job.progress(k, len(views), f"view {view.name}")
-        done, with_field = job.work / f"view_{k:05d}.json", k in drawn
-        check = partial(_check, summarised, _thumbnails(job.work, k) if with_field else [], view, with_points=e.points is not None)
+        done, thumbnails = job.work / f"view_{k:05d}.json", _thumbnails(job.work, k) if k in drawn else []
+        check = partial(_check, summarised, thumbnails, view, with_points=e.points is not None)
         measured = noted(done, dict[str, Measured], warn, check)
         if measured is None:
-            measured, images = evaluate_view(e, view, load_field() if with_field else None, stride)
-            note(done, measured, _save_thumbnails(images, job.work, k) if with_field else ())
+            measured, images = evaluate_view(e, view, load_field() if thumbnails else None, stride)
+            for path, image in zip(thumbnails, images, strict=False):  # of other views there are none
+                write_png(np.asarray(thumbnail_of(image, THUMBNAIL)), path, durable=False)
+            note(done, measured, thumbnails)
         figures.append(measured)
     job.progress(len(views), len(views))
     strips = write_strips(e, load_field, views, strip_views(figures), warn) if settings.strips == "on" else []
@@ -149,13 +145,6 @@ def _check(
 def _thumbnails(folder: Path, k: int) -> list[Path]:
     """The pictures of a view for the contact sheet, one a column."""
     return [folder / f"picture_{k:05d}_{column}.png" for column in range(5)]
-
-
-def _save_thumbnails(images: Sequence[np.ndarray], folder: Path, k: int) -> list[Path]:
-    paths = _thumbnails(folder, k)
-    for path, image in zip(paths, images, strict=True):
-        write_png(np.asarray(thumbnail_of(image, THUMBNAIL)), path, durable=False)
-    return paths
 
 
 def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> None:

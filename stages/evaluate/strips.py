@@ -5,14 +5,12 @@ pixels. The figures of a strip are those of what it shows.
 """
 
 import shutil
-import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from efficientnerf.rendering.field_renderer import FieldRenderer
-from stages.artifacts import EvaluateOutputs
 from stages.evaluate.comparison import Evaluation
 from stages.evaluate.mesh import mesh_image
 from stages.evaluate.summary import quality
@@ -39,7 +37,7 @@ def write_strips(
 ) -> list[dict[str, Any]]:
     """Write the strips of the chosen views; returns their entries of metrics.json. A strip is kept in job.work, so that a kill costs at most one."""
     entries: list[dict[str, Any]] = []
-    job, started, rays = e.job, time.monotonic(), 0
+    job = e.job
     for which, k in chosen:
         job.safe_point()
         job.progress(len(entries), len(chosen), f"strip of {views[k].name}")
@@ -47,14 +45,11 @@ def write_strips(
         entry = noted(done, dict[str, Any], warn, partial(_check, picture, views[k]))
         if entry is None:
             entry = _write_strip(e, load_field(), views[k], picture)
-            rays += entry["width"] * entry["height"]
             note(done, entry, [picture])
-        path = EvaluateOutputs(job.out).strip(which)
+        path = job.out / f"strip_{which}.png"
         shutil.copyfile(picture, path)
         entries.append({"which": which, "file": path.name, **entry})
     job.progress(len(chosen), len(chosen))
-    if rays:
-        job.say(f"strips: the network at {rays} pixels in {time.monotonic() - started:.0f} s (skip with evaluate.strips=off)")
     return entries
 
 

@@ -16,7 +16,7 @@ INVISIBLE = 40.0  # dB: an error of 2.5 of 255 levels; two pictures that differ 
 REDUCED = 4.0  # px of standard deviation from which the photograph is reduced first: the same blur to a hundredth of a level, in a fraction of the time
 
 
-def mean_colour_psnr(truth: np.ndarray, mask: np.ndarray | None = None) -> float:
+def mean_colour_psnr(truth: np.ndarray, mask: np.ndarray | None) -> float:
     """PSNR of a picture of one colour, the mean of the pixels that count: decibels, at most INVISIBLE.
 
     truth  (H, W, 3) float, sRGB 0 to 1
@@ -26,7 +26,7 @@ def mean_colour_psnr(truth: np.ndarray, mask: np.ndarray | None = None) -> float
     return _decibels(float(np.square(used - used.mean(0)).mean()))
 
 
-def blurred_psnrs(truth: np.ndarray, mask: np.ndarray | None = None) -> list[float]:
+def blurred_psnrs(truth: np.ndarray, mask: np.ndarray | None) -> list[float]:
     """PSNR of the photograph blurred by each of BLURS, falling: decibels, at most INVISIBLE. What does not count takes no part in it. Arguments as above."""
     found: list[float] = []
     for blur in BLURS:

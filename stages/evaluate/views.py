@@ -72,6 +72,11 @@ def stride_for(views: Sequence[View], rays: int) -> int:
     return bounded_stride(views, max(1, math.ceil(math.sqrt(total / rays))))
 
 
+def stride_to(camera: Camera, longest: int) -> int:
+    """The stride that leaves at most so many pixels along the longest side."""
+    return max(1, math.ceil(max(camera.width, camera.height) / longest))
+
+
 def bounded_stride(views: Sequence[View], stride: int) -> int:
     """The stride, or the largest one that leaves a pixel of each view."""
     return min([stride, *(min(view.camera.width, view.camera.height) for view in views)])

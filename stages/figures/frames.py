@@ -31,14 +31,10 @@ class RenderOptions:
     background: str = "auto"
     supersample: int = 1  # rays along each side of a pixel
     exr: str = "first"  # "off", "first" or "all": which frames are written as EXR too
-    video: str | None = "turntable.mp4"  # name of the MP4 in the output folder, or None
     # fps, crf: of the video
     fps: int = 30
     crf: int = 18
     compress_level: int = USUAL  # of the PNGs
-
-
-Progress = Callable[[int, int], None]
 
 
 def render_frames(
@@ -46,7 +42,7 @@ def render_frames(
     cameras: Sequence[Camera],
     folder: Path,
     options: RenderOptions,
-    progress: Progress | None = None,
+    progress: Callable[[int, int], None],
     *,
     reuse: bool = False,
     draw: Callable[..., Rendering] | None = None,
@@ -68,8 +64,7 @@ def render_frames(
     writing: deque[Future[None]] = deque()
     with ThreadPoolExecutor(1, "frames") as writer:  # a frame is compressed while the next ones are rendered
         for k, camera in enumerate(cameras):
-            if progress is not None:
-                progress(k, len(cameras))
+            progress(k, len(cameras))
             png, exr = folder / f"frame_{k:04d}.png", folder / f"frame_{k:04d}.exr"
             with_exr = options.exr == "all" or (options.exr == "first" and k == 0)
             outputs = [png, exr] if with_exr else [png]
@@ -84,8 +79,7 @@ def render_frames(
             written += outputs
         for frame in writing:
             frame.result()
-    if progress is not None:
-        progress(len(cameras), len(cameras))
+    progress(len(cameras), len(cameras))
     return written
 
 

@@ -16,44 +16,39 @@ BACKGROUND = (255, 255, 255)
 TEXT = (32, 32, 32)
 
 
-def contact_sheet(
-    rows: Sequence[Sequence[np.ndarray | None]], labels: Sequence[Sequence[str]] | None, path: Path, *, thumbnail: int = 240, title: str = ""
-) -> None:
+def contact_sheet(rows: Sequence[Sequence[np.ndarray]], labels: Sequence[Sequence[str]], path: Path, *, thumbnail: int, title: str = "") -> None:
     """Write a PNG with rows of thumbnails, a label under each.
 
-    rows       images of any size: (H, W), (H, W, 3) or (H, W, 4), uint8 or floating point 0 to 1, sRGB; None: a gap. Rows may differ in length.
-    labels     one text for each image, or None; long ones are elided in the middle
+    rows       images of any size: (H, W), (H, W, 3) or (H, W, 4), uint8 or floating point 0 to 1, sRGB. Rows may differ in length.
+    labels     one text for each image; long ones are elided in the middle
     thumbnail  longest side of the thumbnails, pixels; smaller images are enlarged to it
     """
     if not any(len(row) for row in rows):
         raise ValueError(f"{path}: a contact sheet of no images")
-    thumbnails = [[None if image is None else thumbnail_of(image, thumbnail) for image in row] for row in rows]
-    there = [image for row in thumbnails for image in row if image is not None]
-    cell_w = max((image.width for image in there), default=thumbnail)
-    heights = [max((image.height for image in row if image is not None), default=0) for row in thumbnails]
-    label_h = LABEL_HEIGHT if labels is not None else 0
+    thumbnails = [[thumbnail_of(image, thumbnail) for image in row] for row in rows]
+    cell_w = max(image.width for row in thumbnails for image in row)
+    heights = [max((image.height for image in row), default=0) for row in thumbnails]
     top = MARGIN + (LABEL_HEIGHT + MARGIN if title else 0)
     columns = max(len(row) for row in rows)
-    sheet = Image.new("RGB", (MARGIN + columns * (cell_w + MARGIN), top + sum(height + label_h + MARGIN for height in heights)), BACKGROUND)
+    sheet = Image.new("RGB", (MARGIN + columns * (cell_w + MARGIN), top + sum(height + LABEL_HEIGHT + MARGIN for height in heights)), BACKGROUND)
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=12)
     if title:
         draw.text((MARGIN, MARGIN), _fitted(title, sheet.width - 2 * MARGIN, draw, font), TEXT, font)
     for i, row in enumerate(thumbnails):
         for j, image in enumerate(row):
             x = MARGIN + j * (cell_w + MARGIN)
-            if image is not None:
-                sheet.paste(image, (x + (cell_w - image.width) // 2, top))
-            if labels is not None and labels[i][j]:
+            sheet.paste(image, (x + (cell_w - image.width) // 2, top))
+            if labels[i][j]:
                 draw.text((x, top + heights[i] + 2), _fitted(labels[i][j], cell_w, draw, font), TEXT, font)
-        top += heights[i] + label_h + MARGIN
+        top += heights[i] + LABEL_HEIGHT + MARGIN
     write_png(np.asarray(sheet), path)
 
 
-def grid_sheet(images: Sequence[np.ndarray], labels: Sequence[str], path: Path, *, thumbnail: int = 160, title: str = "") -> None:
+def grid_sheet(images: Sequence[np.ndarray], labels: Sequence[str], path: Path, *, title: str) -> None:
     """A contact sheet of one list of images, row by row, about 3:2."""
     columns = max(1, min(len(images), int(np.ceil(np.sqrt(len(images) * 1.5)))))
     starts = range(0, len(images), columns)
-    contact_sheet([images[s : s + columns] for s in starts], [labels[s : s + columns] for s in starts], path, thumbnail=thumbnail, title=title)
+    contact_sheet([images[s : s + columns] for s in starts], [labels[s : s + columns] for s in starts], path, thumbnail=160, title=title)
 
 
 def thumbnail_of(image: np.ndarray, longest: int) -> Image.Image:

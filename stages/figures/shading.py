@@ -16,9 +16,7 @@ ROUND = (0.0, 90.0, 180.0, 270.0)
 IN_FRONT = (-36.0, -12.0, 12.0, 36.0)  # of forward-facing captures
 
 
-def render_sides(
-    mesh: Mesh, *, heading: float = 0.0, elevation: float = 20.0, turns: Sequence[float] = ROUND, shown: float = 1.0
-) -> np.ndarray:
+def render_sides(mesh: Mesh, *, heading: float, elevation: float, turns: Sequence[float] = ROUND, shown: float = 1.0) -> np.ndarray:
     """Orthographic views of a mesh in a frame with z up, from several sides.
 
     heading    degrees around z that the turns are counted from, from +x

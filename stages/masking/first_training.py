@@ -50,7 +50,7 @@ def first_training_needed(count: int) -> Need:
     space = space_from(np.array([[-1.0] * 3, [1.0] * 3]), contracted=True)
     camera = Camera("", SIDE, SIDE, "SIMPLE_PINHOLE", (SIDE, SIDE / 2, SIDE / 2), np.eye(4))
     view = View("", None, "train", camera, camera, 0.1, 1.0)
-    need = needed(FIRST, [view] * count, 3, space, stored=False)
+    need = needed(FIRST, [view] * count, 3, space)
     return Need({**need.terms, "samples of the field": FIELD_SAMPLES * RAYS})
 
 

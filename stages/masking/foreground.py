@@ -175,7 +175,7 @@ def _draw(photos: Sequence[Photo], images: Sequence[np.ndarray], path: Path) -> 
         pictures.append(np.round(image * share + (1 - share) * OUTSIDE).astype(np.uint8))
         labels.append(f"{photo.camera.name}{'' if photo.mask else ' left out'}")
     count = sum(photo.mask is not None for photo in photos)
-    grid_sheet(pictures, labels, path, thumbnail=160, title=f"{count} of {len(photos)} photographs with a silhouette of the foreground")
+    grid_sheet(pictures, labels, path, title=f"{count} of {len(photos)} photographs with a silhouette of the foreground")
 
 
 def _refused(why: str) -> BadInput:

@@ -35,13 +35,17 @@ class Need:
     def total(self) -> int:
         return sum(self.terms.values())
 
+    def without(self, what: str, count: int) -> "Need":
+        """So many bytes less of a term."""
+        return Need({**self.terms, what: self.terms[what] - count})
+
     def text(self) -> str:
         """The total, and the largest terms."""
         largest = sorted(self.terms.items(), key=lambda term: -term[1])[:TERMS_SHOWN]
         return f"about {size_text(self.total)} of memory ({', '.join(f'{what} {size_text(count)}' for what, count in largest)})"
 
 
-def has_room(job: Job, need: Need) -> bool:
+def fits_now(job: Job, need: Need) -> bool:
     """Whether it fits into what the job may take, and now into what other programs leave. For what changes no bytes."""
     if job.memory is None:
         return True
@@ -50,8 +54,8 @@ def has_room(job: Job, need: Need) -> bool:
 
 
 def most_threads(job: Job, threads: int, need: Callable[[int], Need]) -> int:
-    """As many of the threads as `has_room` for what they take; one where there is space for none."""
-    return next((fewer for fewer in range(threads, 1, -1) if has_room(job, need(fewer))), 1)
+    """As many of the threads as `fits_now` for what they take; one where there is space for none."""
+    return next((fewer for fewer in range(threads, 1, -1) if fits_now(job, need(fewer))), 1)
 
 
 def refuse_what_does_not_fit(job: Job, need: Need, remedy: str) -> None:

@@ -1,7 +1,7 @@
 """The check of a mesh against the asset that it was made of: from captured cameras and from a turntable's."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -25,36 +25,25 @@ WARNED = 0.03  # share of pixels missed or added, from which the stage says so
 PICTURED = 3  # views in the picture: those that agree least
 
 
-def check_cameras(tree: NerfTree) -> list[Camera]:
-    """Some of the captured cameras, where the asset keeps any, and a turntable's."""
-    captured = captured_of(tree.metadata)
-    longer = min(LONGER_SIDE, PIXELS_PER_VOXEL * max(tree.resolution))
-    width, height = (longer, max(1, 3 * longer // 4)) if captured is None else (captured.width, captured.height)
-    scale = longer / max(width, height)
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    out = turntable_cameras(tree, frames=ORBIT, width=size[0], height=size[1])
-    if captured is not None:
-        chosen = captured.poses[np.unique(np.linspace(0, len(captured.poses) - 1, CAPTURED).round().astype(int))]
-        lens = (captured.focal * scale, size[0] / 2, size[1] / 2)
-        out = [Camera(f"captured_{n:04d}", *size, "SIMPLE_PINHOLE", lens, pose) for n, pose in enumerate(chosen)] + out
-    return out
-
-
-def other_cameras(tree: NerfTree, known: list[Camera]) -> list[Camera]:
-    """Captured cameras that are not among those of the check, with images of the same size; of an asset that keeps none a turntable's between them."""
-    captured, size = captured_of(tree.metadata), (known[0].width, known[0].height)
+def check_cameras(tree: NerfTree) -> tuple[list[Camera], list[Camera]]:
+    """The cameras of the check: some of the captured ones, where the asset keeps any, and a turntable's. And others, whose depths are fused too: captured ones,
+    or of a turntable between those."""
+    captured, longer = captured_of(tree.metadata), min(LONGER_SIDE, PIXELS_PER_VOXEL * max(tree.resolution))
     if captured is None:
-        return turntable_cameras(tree, frames=2 * ORBIT, width=size[0], height=size[1])[1::2]
-    count = len(captured.poses)
-    left = np.setdiff1d(np.arange(count), np.linspace(0, count - 1, CAPTURED).round().astype(int))
-    chosen = left[np.unique(np.linspace(0, len(left) - 1, min(FUSED, len(left))).round().astype(int))]
-    return [replace(known[0], name=f"captured_{n:04d}", world_from_camera=captured.poses[n]) for n in chosen]
+        size = {"width": longer, "height": max(1, 3 * longer // 4)}
+        return turntable_cameras(tree, frames=ORBIT, **size), turntable_cameras(tree, frames=2 * ORBIT, **size)[1::2]
+    cameras = captured.cameras(longer / max(captured.width, captured.height))
+    chosen = np.unique(np.linspace(0, len(cameras) - 1, CAPTURED).round().astype(int))
+    left = np.setdiff1d(np.arange(len(cameras)), chosen)
+    others = left[np.unique(np.linspace(0, len(left) - 1, min(FUSED, len(left))).round().astype(int))]
+    orbit = turntable_cameras(tree, frames=ORBIT, width=cameras[0].width, height=cameras[0].height)
+    return [cameras[n] for n in chosen] + orbit, [cameras[n] for n in others]
 
 
 def asset_views(tree: NerfTree, progress: Callable[[int, int, str], None]) -> tuple[list[AssetView], list[AssetView]]:
     """What the cameras of the check see of the asset; and these with others, whose depths are fused."""
-    checking = check_cameras(tree)
-    cameras, out = [*checking, *other_cameras(tree, checking)], []
+    checking, others = check_cameras(tree)
+    cameras, out = [*checking, *others], []
     for number, camera in enumerate(cameras):
         out.append(asset_view(tree, camera))
         progress(number + 1, len(cameras), "views of the asset")

@@ -5,7 +5,7 @@ import json
 import struct
 from math import prod
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from stages.formats.exporters.obj import head as obj_head
 from stages.formats.exporters.ply import FACE, VERTEX
 from stages.formats.exporters.ply import mesh_header as ply_header
 from stages.formats.exporters.writing import MOST_TEXELS, SourceFrame, write_parts
+from stages.io.meshes.glb import Glb
 from stages.io.pictures import UnreadableImage, read_header
 from stages.io.png import read_png
 
@@ -92,33 +93,24 @@ def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def _read_texture(outputs: MeshOutputs, faces: np.ndarray, positions: np.ndarray) -> Texture | None:
     """The texture of a mesh of these faces, in the order of the GLB; None where it has none."""
     path = outputs.glb
-    data = _data(path)
-    if len(data) < 20 or struct.unpack_from("<I", data, 8)[0] != len(data):
-        _refuse(path, "cut off")
     try:
-        size = struct.unpack_from("<I", data, 12)[0]
-        document, blob = json.loads(data[20 : 20 + size]), data[28 + size :]
-        (primitive,) = document["meshes"][0]["primitives"]
-        if "TEXCOORD_0" not in primitive["attributes"]:
-            return None
-        corners = _accessor(document, blob, primitive["indices"], "<u4", 1).reshape(-1, 3).astype(np.int64)
-        coordinates = _accessor(document, blob, primitive["attributes"]["TEXCOORD_0"], "<f4", 2).astype(np.float64) * [1, -1] + [0, 1]
-        places = _accessor(document, blob, primitive["attributes"]["POSITION"], "<f4", 3)
-        turn = np.array(document["nodes"][0]["extras"]["source_frame"]["gltf_from_capture"], np.float64)[:3, :3]
+        with open(path, "rb") as file:
+            glb = Glb(file, path.stat().st_size)
+            (primitive,) = glb.document["meshes"][0]["primitives"]
+            attributes = primitive["attributes"]
+            if "TEXCOORD_0" not in attributes:
+                return None
+            accessors = ((primitive["indices"], "SCALAR"), (attributes["TEXCOORD_0"], "VEC2"), (attributes["POSITION"], "VEC3"))
+            corners, coordinates, places = (np.concatenate([*glb.rows(number, kind)]) for number, kind in accessors)
+        corners, coordinates = corners.reshape(-1, 3).astype(np.int64), coordinates.astype(np.float64) * [1, -1] + [0, 1]
+        turn = np.array(glb.document["nodes"][0]["extras"]["source_frame"]["gltf_from_capture"], np.float64)[:3, :3]
         same = corners.shape == faces.shape and np.allclose(places[corners] @ turn, positions[faces], rtol=1e-5, atol=1e-5 * float(np.abs(positions).max()))
         at = np.clip(coordinates[corners], 0, 1)
-    except (ValueError, KeyError, IndexError, TypeError, struct.error, OSError) as error:
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError, OSError) as error:
         _refuse(path, f"not as it was written ({type(error).__name__})")
     if not same:
         _refuse(path, "its faces are not those of the PLY next to it")
     return Texture(at, _picture(outputs.texture))
-
-
-def _accessor(document: Any, blob: bytes, index: int, kind: str, width: int) -> np.ndarray:
-    entry = document["accessors"][index]
-    view = document["bufferViews"][entry["bufferView"]]
-    return np.frombuffer(blob, kind, entry["count"] * width, view["byteOffset"]).reshape(-1, width)
-
 
 
 def _picture(path: Path) -> np.ndarray:

@@ -8,7 +8,6 @@ from efficientnerf.surface.fitting.photometric import MAX_PIXELS
 from efficientnerf.surface.fusion import MARGIN
 from efficientnerf.surface.isosurface import BLOCK, pool_of
 from efficientnerf.surface.volume import VOXELS_AT_ONCE, volume_of
-from stages.artifacts import PosesOutputs
 from stages.io.scene import load, views_of
 from stages.memory.forecast import Known
 from stages.memory.need import MIB, SURFACES, Need, libraries
@@ -32,7 +31,7 @@ FITTED_VERTEX = 1600
 WRITTEN_FACE, WRITTEN_TEXEL, SHEET, FACES, TEXELS = 180, 3, 3 * MIB // 4, 4, 4
 
 
-def surface_needed(tree: NerfTree, texture: int = 0, pixels: int = 0, fitted: int = 0) -> Need:
+def surface_needed(tree: NerfTree, texture: int, pixels: int, fitted: int = 0) -> Need:
     """Memory to mesh a tree and to texture it: so many texels a side, photographs of so many pixels, and so many vertices fitted to photographs."""
     views = CAPTURED + ORBIT + FUSED
     pool = pool_of(volume_of(tree))
@@ -63,12 +62,12 @@ def _most_faces(tree: NerfTree, settings: MeshSettings) -> int:
 
 def memory_needed(known: Known) -> Need:
     """`needed` for all of the asset."""
-    return needed(asset_of(known), known.settings["mesh"], PosesOutputs.of_run(known.run).folder)
+    return needed(asset_of(known), known.settings["mesh"], known.run / "poses")
 
 
 def space_needed(known: Known) -> int:
     """Mesh files, textures and pictures."""
-    own, views = known.settings["mesh"], views_of(load(PosesOutputs.of_run(known.run).folder), "train")
+    own, views = known.settings["mesh"], views_of(load(known.run / "poses"), "train")
     faces = _most_faces(asset_of(known), own)
     texels = 0 if own.texture == "off" else min(own.texture_size**2, TEXELS * count_pixels(views))
     return SHEET + WRITTEN_FACE * faces + WRITTEN_TEXEL * texels

@@ -37,18 +37,16 @@ SURFACE_SHARE = 0.7  # of the stage's time; the texture takes the rest
 
 
 def mesh_of(
-    tree: NerfTree, settings: MeshSettings, progress: Callable[[int, int, str], None], views: list[AssetView] | None = None, region: Region | None = None,
-) -> Mesh:  # fmt: skip
-    """The tree's surface in the training frame; `progress` takes (done, total, text). Raises UsageError where there is none at a density that was stated;
-    else it has no faces then, and "no_surface" among its facts says why.
+    tree: NerfTree, settings: MeshSettings, progress: Callable[[int, int, str], None], region: Region | None = None
+) -> tuple[Mesh, list[AssetView]]:
+    """The tree's surface in the training frame, and the views of the asset that say which components it shows. Raises UsageError where there is no surface at
+    a density that was stated; else it has no faces then, and "no_surface" among its facts says why.
 
-    views   is given those of the asset that say which components it shows
-    region  that the surface is clipped to
+    progress  takes (done, total, text)
+    region    that the surface is clipped to
     """
     progress = whole_progress(progress, 1 + len(tree.outer))
     seen, fused = asset_views(tree, progress)
-    if views is not None:
-        views += seen
     threshold = resolved(settings.density_threshold)
 
     def tick() -> None:
@@ -71,7 +69,7 @@ def mesh_of(
         if threshold is not None:
             raise UsageError(f"mesh: {error}. {remedy(threshold)}") from error
         mesh = nothing(str(error))
-    return replace(mesh, facts=mesh.facts | {"threshold_chosen": "automatic" if threshold is None else "given"})
+    return replace(mesh, facts=mesh.facts | {"threshold_chosen": "automatic" if threshold is None else "given"}), seen
 
 
 def nothing(why: str) -> Mesh:
@@ -79,7 +77,7 @@ def nothing(why: str) -> Mesh:
     return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.float32), {"no_surface": why})
 
 
-def whole_progress(progress: Callable[[int, int, str], None], grids: int = 1) -> Callable[[int, int, str], None]:
+def whole_progress(progress: Callable[[int, int, str], None], grids: int) -> Callable[[int, int, str], None]:
     """Progress over views of the asset and the parts of the surfaces of so many grids together: a bar that never goes back."""
     begun: list[str] = []
     reached, most = 0, 1 + grids * len(PARTS)
@@ -162,10 +160,9 @@ def run(job: Job) -> None:
     tree = restricted(whole, settings.region)
     frame = source_frame(tree.metadata)
     refuse_what_does_not_fit(job, needed(tree, settings, captured[0]), "Lower bake.max_mib, bake.resolution or mesh.texture_size.")
-    seen: list[AssetView] = []
     share = 1.0 if settings.texture == "off" else SURFACE_SHARE
     border = whole.region if settings.region == "foreground" else None
-    surface = mesh_of(tree, settings, lambda done, total, text: job.reached(share * done, total, text), seen, border)
+    surface, seen = mesh_of(tree, settings, lambda done, total, text: job.reached(share * done, total, text), border)
     if "no_surface" in surface.facts:
         write_empty(outputs, surface, seen, frame, job)
         return

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 
 from efficientnerf.asset.tree import NerfTree
-from stages.artifacts import PosesOutputs, TrainOutputs
 from stages.io.refined_cameras import load_scene
 from stages.io.scene import views_of
 from stages.memory.forecast import Known
@@ -64,7 +63,7 @@ def memory_needed(known: Known) -> Need:
     """`needed` for all of the asset."""
     if known.settings["splats"].make == "off":
         return Need({"libraries": libraries(known.device)})
-    return needed(asset_of(known), known.settings["splats"], _captured(known), known.device)
+    return needed(asset_of(known), known.settings["splats"], (known.run / "poses", known.run / "train"), known.device)
 
 
 def space_needed(known: Known) -> int:
@@ -72,10 +71,5 @@ def space_needed(known: Known) -> int:
     own = known.settings["splats"]
     if own.make == "off":
         return 0
-    count = most_gaussians(own, pixels_of(asset_of(known), own, _captured(known)))
+    count = most_gaussians(own, pixels_of(asset_of(known), own, (known.run / "poses", known.run / "train")))
     return SHEET + (WRITTEN_FLOAT * (3 + parameters_of(own)) + SPZ) * count  # with a normal
-
-
-def _captured(known: Known) -> tuple[Path, Path]:
-    """Folders of the stages poses and train."""
-    return PosesOutputs.of_run(known.run).folder, TrainOutputs.of_run(known.run).folder

@@ -52,7 +52,4 @@ def render_cameras(tree: NerfTree) -> list[Camera]:
     captured = captured_of(tree.metadata)
     if captured is None:
         return turntable_cameras(tree, frames=ORBIT, width=LONGER_SIDE, height=3 * LONGER_SIDE // 4)
-    scale = min(1.0, LONGER_SIDE / max(captured.width, captured.height))
-    width, height = max(1, round(captured.width * scale)), max(1, round(captured.height * scale))
-    lens = (captured.focal * scale, width / 2, height / 2)
-    return [Camera(f"captured_{n:04d}", width, height, "SIMPLE_PINHOLE", lens, pose) for n, pose in enumerate(captured.poses)]
+    return captured.cameras(min(1.0, LONGER_SIDE / max(captured.width, captured.height)))

@@ -32,7 +32,7 @@ from stages.formats.exporters.writing import source_frame
 from stages.framing.restriction import restricted
 from stages.io.png import write_png
 from stages.io.refined_cameras import load_scene
-from stages.memory.device import free_on_device
+from stages.memory.device import fits_on_device
 from stages.memory.need import refuse_what_does_not_fit
 from stages.splats.memory import most_gaussians, needed, needed_on_device
 from stages.splats.pictures import photographs, render_cameras, renders
@@ -98,16 +98,6 @@ def run(job: Job) -> None:
         job.warn(f"no Gaussians are made; the run continues: {error}")
 
 
-def _on_device(job: Job, tree: NerfTree) -> NerfTree:
-    """The tree on the run's device, where Gaussians are then fitted; on the host where the device's memory is too small."""
-    need = needed_on_device(job.settings)
-    if job.device == "cpu" or need <= (free := free_on_device(job.device)):
-        return tree.to(job.device)
-    job.warn(f"{job.settings.count:,} Gaussians need about {need / 2**30:.1f} GiB on the device; {free / 2**30:.1f} GiB are free."
-             " They are fitted on the CPU, which takes longer. Lower splats.count to use the device.")  # fmt: skip
-    return tree
-
-
 def _make(job: Job, outputs: SplatsOutputs, settings: SplatsSettings) -> None:
     """Raises UsageError where memory is too small, StageFailed where nothing shows."""
     started = time.monotonic()
@@ -115,7 +105,8 @@ def _make(job: Job, outputs: SplatsOutputs, settings: SplatsSettings) -> None:
     captured = job.inputs["poses"], job.inputs["train"]
     remedy = f"Lower splats.count ({settings.count}), poses.max_image_size or bake.max_mib."
     refuse_what_does_not_fit(job, needed(tree, settings, captured, job.device), remedy)
-    tree = _on_device(job, tree)
+    if fits_on_device(job, needed_on_device(settings), f"fitting {settings.count:,} Gaussians", "Lower splats.count"):
+        tree = tree.to(job.device)
     try:
         gaussians = gaussians_of(tree, settings, job.reached, captured)
     except torch.OutOfMemoryError:

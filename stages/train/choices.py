@@ -43,16 +43,11 @@ class TrainingChoices:
 
     def scene(self, given: Scene) -> Scene:
         """The scene with these choices: its near planes and masks."""
-        most = self._farthest_near(given)
-        if self.masks and most is None:
+        if self.masks and self.near == "stated":
             return given
-        views = (replace(view, near=view.near if most is None else min(view.near, most), mask=view.mask if self.masks else None) for view in given.views)
+        most = {"stated": np.inf, "median": np.median([view.near for view in given.views]), "off": NEAR_SHARE * given.orbit.radius}[self.near]
+        views = (replace(view, near=min(view.near, float(most)), mask=view.mask if self.masks else None) for view in given.views)
         return replace(given, views=tuple(views))
-
-    def _farthest_near(self, s: Scene) -> float | None:
-        if self.near == "stated":
-            return None
-        return float(np.median([view.near for view in s.views])) if self.near == "median" else NEAR_SHARE * s.orbit.radius
 
 
 class _Document(msgspec.Struct):

@@ -147,15 +147,13 @@ def sparse_depth_of(folder: Path, s: Scene, seed: int = 0) -> SparseDepthRays | 
     before = (offset * forward[view]).sum(1) > MIN_DISTANCE  # so is the distance; what is not a number is not before anything
     if not before.any():
         return None
-    point, view = point[before], view[before]
+    point, view, to_point, length = point[before], view[before], offset[before], distance[before]
     origins = np.concatenate([centres[view], _between(point, view, centres)])
     offset = np.concatenate([xyz[point]] * 2) - origins
     distance = np.linalg.norm(offset, axis=1)
     found = _rays(origins, offset / distance[:, None], distance, on_support=False)
     middle, reach = s.bounds.mean(axis=0), NEAR_THE_SCENE * (s.bounds[1] - s.bounds[0]).max() / 2
     near = (np.abs(xyz - middle) <= reach).all(axis=1)
-    to_point = xyz[point] - centres[view]
-    length = np.linalg.norm(to_point, axis=1)
     support = opaque_support(xyz[tracked & near], centres[in_training], centres[view], to_point / length[:, None], length)
     return found if support is None else _with_support(found, support, scene.views_of(s, "train"), seed)
 

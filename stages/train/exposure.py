@@ -23,8 +23,8 @@ BORDER = 1  # pixels round that of an observation whose mean is taken
 def observed_light(folder: Path, s: Scene, pixels: Pixels) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Sparse points in the training photographs: logarithms of linear light (O, 3), the point (O,), the photograph (O,), and r^2 (O,) in it."""
     xyz, counts, observers = scene.read_observations(folder)
-    number = np.cumsum([view.split == "train" for view in s.views]) - 1
     in_training = np.array([view.split == "train" for view in s.views])
+    number = np.cumsum(in_training) - 1
     point = np.repeat(np.arange(len(counts)), counts)
     used = in_training[observers]
     seen = np.bincount(point[used], minlength=len(counts))

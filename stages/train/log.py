@@ -1,9 +1,10 @@
-"""The log of a training run, and the curve that is drawn of it."""
+"""The log of a training run or a refinement, and the curve that is drawn of it."""
 
 import json
 import math
+import shutil
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,31 +28,69 @@ class _Line(msgspec.Struct):
     preview_psnr: Annotated[float, msgspec.Meta(ge=-1000, le=1000)] | None = None
 
 
-class TrainLog:
-    """log.jsonl: a line every few steps, and at each preview.
+class Log:
+    """log.jsonl of a stage. Lines are written by `flush`."""
+
+    def __init__(self, path: Path, step: int) -> None:
+        """
+        step  that is gone on from; lines after it are dropped, for they will be logged again
+        """
+        self.path = path
+        self.unwritten: list[str] = []
+        kept = [line for line in read_lines(path) if line["step"] <= step]
+        remove(path)  # a folder of that name could not be replaced
+        write_atomically(path, "".join(json.dumps(line, sort_keys=True) + "\n" for line in kept).encode(), durable=False)
+
+    def add(self, line: dict[str, Any]) -> None:
+        self.unwritten.append(json.dumps(line, sort_keys=True))
+
+    def flush(self) -> None:
+        with open(self.path, "a", encoding="utf-8") as file:
+            file.writelines(line + "\n" for line in self.unwritten)
+        self.unwritten.clear()
+
+    def draw_curve(self, path: Path) -> None:
+        """PSNR over steps, of the training rays and of the previews."""
+        lines = [*read_lines(self.path), *map(json.loads, self.unwritten)]
+        known = [x for x in lines if x["psnr"] is not None]
+        series = {"training rays, running mean": ([x["step"] for x in known], [x["psnr"] for x in known])}
+        previews = [(x["step"], x["preview_psnr"]) for x in lines if x.get("preview_psnr") is not None]
+        if previews:
+            series["preview view"] = ([step for step, _ in previews], [psnr for _, psnr in previews])
+        with atomic(path, durable=False) as temporary:
+            curve(temporary, series, x_label="step", y_label="PSNR / dB")
+
+    def publish(self, path: Path, curve_path: Path) -> None:
+        """Write the whole log, and its curve, to these files of the artifact."""
+        self.flush()
+        shutil.copyfile(self.path, path)
+        self.draw_curve(curve_path)
+
+
+class TrainLog(Log):
+    """The log of a training run: a line every few steps, and at each preview.
 
         seconds       of the stage so far, previews and checkpoints included
         step_seconds  of a step alone, the mean since the last line
         loss, psnr    running means over the training rays
         left_out      of the step's rays, those whose samples did not fit their capacity
 
-    On CUDA counts and the fraction of valid voxels are those of some steps before (`efficientnerf.training.readback`). Lines are written by `flush`.
+    On CUDA counts and the fraction of valid voxels are those of some steps before (`efficientnerf.training.readback`).
     """
 
     def __init__(self, path: Path, step: int, spent: float, occupied: Callable[[], float], clock: Callable[[], float]) -> None:
         """
-        step, spent  the step that training goes on from, and the seconds up to it; lines after it are dropped, for they will be logged again
+        step, spent  the step that training goes on from, and the seconds up to it
         occupied     the fraction of valid voxels
         clock        seconds, monotonic
         """
-        self.path, self.first, self.spent, self.occupied, self.clock = path, step, spent, occupied, clock
+        super().__init__(path, step)
+        self.first, self.spent, self.occupied, self.clock = step, spent, occupied, clock
         self.began = self.step_began = clock()
         self.logged, self.working = step, 0.0
         self.loss, self.fraction = 0.0, 0.0
         self.rates: dict[str, Any] = {}
         self.recent: deque[tuple[int, float]] = deque(maxlen=RECENT + 1)  # steps, and the seconds up to each
-        self.unwritten: list[str] = []
-        continue_log(path, step)
 
     @property
     def seconds(self) -> float:
@@ -75,7 +114,7 @@ class TrainLog:
         if due or psnr is not None or not self.rates:
             self.fraction = self.occupied()
         if due or psnr is not None:
-            self.unwritten.append(json.dumps(self._line(done, seconds, psnr), sort_keys=True))
+            self.add(self._line(done, seconds, psnr))
             self.working, self.logged = 0.0, done.step
         if due or not self.rates:
             self.rates = self._rates(done, goal, seconds)
@@ -107,34 +146,6 @@ class TrainLog:
             "left_out": done.left_out,
             "occupied": self.fraction,
         }
-
-    def flush(self) -> None:
-        with open(self.path, "a", encoding="utf-8") as file:
-            file.writelines(line + "\n" for line in self.unwritten)
-        self.unwritten.clear()
-
-    def draw_curve(self, path: Path) -> None:
-        """PSNR over steps, of the training rays and of the previews."""
-        draw_curve(path, self.path, map(json.loads, self.unwritten))
-
-
-def continue_log(path: Path, step: int) -> None:
-    """Leave the lines of a log up to a step that is gone on from; an empty file where there is none yet."""
-    kept = [line for line in read_lines(path) if line["step"] <= step]
-    remove(path)  # a folder of that name could not be replaced
-    write_atomically(path, "".join(json.dumps(line, sort_keys=True) + "\n" for line in kept).encode(), durable=False)
-
-
-def draw_curve(path: Path, log: Path, more: Iterable[dict[str, Any]] = ()) -> None:
-    """Draw PSNR over steps, of the training rays and of the previews, of a log's lines and those that are not written yet."""
-    lines = [*read_lines(log), *more]
-    known = [x for x in lines if x["psnr"] is not None]
-    series = {"training rays, running mean": ([x["step"] for x in known], [x["psnr"] for x in known])}
-    previews = [(x["step"], x["preview_psnr"]) for x in lines if x.get("preview_psnr") is not None]
-    if previews:
-        series["preview view"] = ([step for step, _ in previews], [psnr for _, psnr in previews])
-    with atomic(path, durable=False) as temporary:
-        curve(temporary, series, x_label="step", y_label="PSNR / dB")
 
 
 def psnr_of(loss: float) -> float:

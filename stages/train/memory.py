@@ -14,7 +14,7 @@ from stages.artifacts import PosesOutputs
 from stages.io.field_file import space_of
 from stages.io.scene import View, load, views_of
 from stages.memory.forecast import Known
-from stages.memory.need import Need, has_room, libraries, refuse_what_does_not_fit
+from stages.memory.need import Need, fits_now, libraries, refuse_what_does_not_fit
 from stages.train.data import MOST_OBSERVATIONS, channels_of, count_pixels, reading_threads
 from stages.train.hash_resolution import with_auto_sizes
 from stages.train.pixel_file import PixelFile
@@ -31,11 +31,8 @@ WRITTEN, CHECKPOINT, WRITTEN_VOXEL, CHANNELS = 4, 12, 5, 4
 KEPT = 3
 
 
-def pixels_needed(views: Sequence[View], channels: int, *, stored: bool) -> dict[str, int]:
-    """The terms of `efficientnerf.training.pixels.Pixels`.
-
-    stored  whether the pixels are in a file
-    """
+def pixels_needed(views: Sequence[View], channels: int) -> dict[str, int]:
+    """The terms of `efficientnerf.training.pixels.Pixels`, in memory."""
     cameras = [view.camera for view in views]
     total = count_pixels(tuple(views))
     lenses = {(camera.width, camera.height, camera.model, camera.params) for camera in cameras}
@@ -45,7 +42,7 @@ def pixels_needed(views: Sequence[View], channels: int, *, stored: bool) -> dict
     masks = total // 8 + int(4 * LISTED_SHARE * total) if any(view.mask is not None for view in views) else 0
     largest = max(camera.width * camera.height for camera in cameras)
     return {
-        PIXELS: (0 if stored else total * channels) + masks,
+        PIXELS: total * channels + masks,
         "reading images": (1 + 2 * reading_threads()) * channels * largest,  # as decoded, and one as it is put in rows
         "directions of pixels": 12 * sum(knots) + DIRECTION * max(knots),
     }
@@ -59,38 +56,34 @@ def parameters(settings: TrainSettings) -> int:
     return hidden + FEATURES * sum(sum(level_sizes(**grid)[1]) for grid in grids(settings))
 
 
-def samples_of(settings: TrainSettings, intervals: int) -> int:
-    """Samples of a step at most, about.
+def step_bytes(settings: TrainSettings, intervals: int) -> int:
+    """Bytes of a step's samples, kept for the backward pass, about. Kernels of hash grids keep features and outputs; other fields keep each layer.
 
     intervals  on a ray, at most
     """
     fine = settings.max_pivots * settings.samples_per_pivot if settings.sampling == "efficient" else settings.num_importance_samples
-    most = settings.max_rays_per_batch * (intervals + fine)
-    return most if settings.sample_batch_size == "off" else min(most, 2 * settings.sample_batch_size)
-
-
-def sample_bytes(settings: TrainSettings) -> int:
-    """Bytes of a sample in a step, kept for the backward pass. Kernels of hash grids keep features and outputs; other fields keep each layer."""
+    samples = settings.max_rays_per_batch * (intervals + fine)
+    if settings.sample_batch_size != "off":
+        samples = min(samples, 2 * settings.sample_batch_size)
     outputs = 1 + 3 * (settings.sh_degree + 1) ** 2
     if settings.field == "hash":
-        return 4 * (4 * settings.num_levels + 6 * outputs + 32)
-    return 2 * settings.hidden_dim * settings.num_layers + 4 * (4 * 63 + 6 * outputs + 32)
+        return samples * 4 * (4 * settings.num_levels + 6 * outputs + 32)
+    return samples * (2 * settings.hidden_dim * settings.num_layers + 4 * (4 * 63 + 6 * outputs + 32))
 
 
-def needed(settings: TrainSettings, views: Sequence[View], channels: int, space: Space, *, stored: bool, device: str = "cpu", points: int = 0) -> Need:
-    """Memory of training.
+def needed(settings: TrainSettings, views: Sequence[View], channels: int, space: Space, device: str = "cpu", points: int = 0) -> Need:
+    """Memory of training, with the pixels there.
 
     settings  with numbers for what is "auto" (`stages.train.hash_resolution`)
     channels  of the pixels
-    stored    whether the pixels are in a file
     points    bytes of the file of sparse points
     """
-    pixels = pixels_needed(views, channels, stored=stored)
+    pixels = pixels_needed(views, channels)
     reading = pixels["reading images"] + pixels["directions of pixels"]
     intervals = space.max_intervals(space.sampled_length(None) / (resolved(settings.num_coarse_samples) or space.num_coarse_samples))
     return Need({
         PIXELS: pixels[PIXELS],
-        "a step's samples, or reading images": max(samples_of(settings, intervals) * sample_bytes(settings), reading),
+        "a step's samples, or reading images": max(step_bytes(settings, intervals), reading),
         "parameters and checkpoints": 4 * (TABLES + SAVED) * parameters(settings),
         "density voxels": DENSITY_VOXEL * (resolved(settings.occupancy_resolution) or space.occupancy_resolution) ** 3,
         "sparse points": POINTS * points + OBSERVATION * min(MOST_OBSERVATIONS, points // 8),
@@ -98,17 +91,17 @@ def needed(settings: TrainSettings, views: Sequence[View], channels: int, space:
     })  # fmt: skip
 
 
-def place_pixels(job: Job, need: Need, views: Sequence[View], channels: int, remedy: str, *, stored: bool) -> PixelRows | None:
-    """Where the training pixels are put: None for memory, or a file in the scratch folder. Raises UsageError where the need does not fit.
+def place_pixels(job: Job, most: Need, least: Need, views: Sequence[View], channels: int, remedy: str) -> PixelRows | None:
+    """Where the training pixels are put: None for memory, or a file in the scratch folder. Raises UsageError where even `least` does not fit then.
 
-    need    with the pixels there
-    remedy  as for `refuse_what_does_not_fit`
-    stored  whether in a file
+    most, least  the need with the pixels in memory, at most and at least
+    remedy       as for `refuse_what_does_not_fit`
     """
-    refuse_what_does_not_fit(job, need, remedy)
-    if not stored:
+    if fits_now(job, most):
+        refuse_what_does_not_fit(job, least, remedy)
         return None
     pixels = count_pixels(tuple(views))
+    refuse_what_does_not_fit(job, least.without(PIXELS, pixels * channels), remedy)
     job.warn(
         f"the training pixels, {size_text(pixels * channels)}, do not fit into memory and are kept in a file, which is slower to read."
         " Raise --memory, or lower poses.max_image_size."
@@ -118,24 +111,23 @@ def place_pixels(job: Job, need: Need, views: Sequence[View], channels: int, rem
 
 def rows_for_training(job: Job, folder: Path, views: tuple[View, ...], settings: TrainSettings, space: Space) -> PixelRows | None:
     """`place_pixels` for the stage train; `settings` as for `needed`."""
-    here, there = (training_needed(folder, views, settings, space, stored=stored, device=job.device) for stored in (False, True))
-    stored = not has_room(job, here)
     tables = f"train.log2_hashmap_size ({settings.log2_hashmap_size}), " if settings.field == "hash" else ""
     batch = "train.max_rays_per_batch" if settings.sample_batch_size == "off" else "train.sample_batch_size"
     remedy = f"Lower {tables}{batch} ({getattr(settings, batch[6:])}) or poses.max_image_size."
-    return place_pixels(job, there if stored else here, views, channels_of(folder, views), remedy, stored=stored)
+    need = training_needed(folder, views, settings, space, job.device)
+    return place_pixels(job, need, need, views, channels_of(folder, views), remedy)
 
 
-def training_needed(folder: Path, views: tuple[View, ...], settings: TrainSettings, space: Space, *, stored: bool, device: str) -> Need:
+def training_needed(folder: Path, views: tuple[View, ...], settings: TrainSettings, space: Space, device: str) -> Need:
     """Memory of the stage train, `folder` being the scene's; the rest as for `needed`."""
     file = PosesOutputs(folder).points
     points = file.stat().st_size if file.is_file() else 0
-    return needed(settings, views, channels_of(folder, views), space, stored=stored, device=device, points=points)
+    return needed(settings, views, channels_of(folder, views), space, device, points)
 
 
 def memory_needed(known: Known) -> Need:
     """Memory of the stage train."""
-    return training_needed(PosesOutputs.of_run(known.run).folder, *_before(known), stored=False, device=known.device)
+    return training_needed(known.run / "poses", *_before(known), known.device)
 
 
 def space_needed(known: Known) -> int:
@@ -150,6 +142,6 @@ def space_needed(known: Known) -> int:
 
 def _before(known: Known) -> tuple[tuple[View, ...], TrainSettings, Space]:
     """Training views, settings without "auto" as for `needed`, and the field's space."""
-    s = load(PosesOutputs.of_run(known.run).folder)
+    s = load(known.run / "poses")
     views = views_of(s, "train")
     return views, with_auto_sizes(known.settings["train"], s, count_pixels(views)), space_of(s)

@@ -1,6 +1,5 @@
 """Renders of one view now and then, next to its photograph."""
 
-import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,7 @@ from efficientnerf.evaluation.metrics import WINDOW, psnr, ssim
 from efficientnerf.geometry.cameras import Camera
 from pipeline.files import is_denied
 from pipeline.text import printable
-from stages.evaluate.views import ground_truth, subsample_camera
+from stages.evaluate.views import ground_truth, stride_to, subsample_camera
 from stages.figures.plots import to_uint8
 from stages.io.png import read_png, write_png
 from stages.io.scene import Scene, View, views_of
@@ -48,7 +47,7 @@ class Previews:
         if self.view is None:
             return None
 
-        stride = max(1, math.ceil(max(self.view.camera.width, self.view.camera.height) / SIDE))
+        stride = stride_to(self.view.camera, SIDE)
         truth = ground_truth(self.poses, self.view, self.background, stride).colour
         render = np.clip(self.render(subsample_camera(self.view.camera, stride)), 0, 1)
         write_png(to_uint8(np.concatenate([truth, render], axis=1)), self.work / f"preview_{step:06d}.png")

@@ -26,8 +26,6 @@ from stages.framing.view_coverage import MAX_CONTRADICTED, Masks, cells_before_n
 from stages.io import scene
 from stages.io.scene import View
 
-MIN_VIEWS, NEAR_PLANES, MASKS = "min_views", "near_planes", "masks"
-
 
 @dataclass(frozen=True)
 class Prior:
@@ -62,12 +60,12 @@ def mask_uncovered_cells(m: Model, views: tuple[View, ...], job: Job) -> tuple[P
 
 
 def mask_cells_by(
-    m: Model, cameras: Sequence[Camera], near: Sequence[float], masks: Masks | None, filled: np.ndarray | None = None
+    m: Model, cameras: Sequence[Camera], near: Sequence[float], masks: Masks | None, filled: np.ndarray | None
 ) -> tuple[Prior, ...]:
     """The same by the views' cameras and near planes, what their masks keep, and the reliable sparse points (F, 3)."""
     found = []
     for name, cells in _cells_of_priors(m, cameras, near, masks, filled):
-        against = 0.0 if name == MASKS or filled is None else contradicted(cells, m.space, filled)
+        against = 0.0 if name == "masks" or filled is None else contradicted(cells, m.space, filled)
         found.append(Prior(name, float(cells.mean()), against, against <= MAX_CONTRADICTED))
         if found[-1].applied:
             mask_cells(m.voxels, torch.from_numpy(cells))
@@ -80,11 +78,11 @@ def _cells_of_priors(
     """The names of the priors that a scene calls for, and the density voxels (D, D, D) bool that each masks."""
     few, side = resolved(m.settings.min_views) if m.space.contracted else None, m.voxels.side
     if few is not None:
-        yield MIN_VIEWS, cells_below_min_views(m.space, cameras, few, side, masks)
+        yield "min_views", cells_below_min_views(m.space, cameras, few, side, masks)
     if m.space.contracted:
-        yield NEAR_PLANES, cells_before_near(m.space, cameras, near, side, filled)
+        yield "near_planes", cells_before_near(m.space, cameras, near, side, filled)
     if masks is not None:
-        yield MASKS, cells_without_view(m.space, cameras, side, masks)
+        yield "masks", cells_without_view(m.space, cameras, side, masks)
 
 
 def filled_points(folder: Path, views: int) -> np.ndarray | None:

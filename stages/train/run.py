@@ -1,17 +1,6 @@
-"""The train stage: a scene in, a trained field out.
-
-field.safetensors  both fields, the density voxels, what they mean; the schedule; the exposure of photographs where it was learned
-cameras.json       the training cameras, where some were replaced, and the views that were left out
-choices.json       what training did otherwise than the scene and the settings state, where it learned nothing with them
-wrong_views.png    photographs and renders of these views
-report.json        steps and seconds
-log.jsonl          a line every few steps
-curve.png          PSNR over steps
-previews/          renders of a validation view
-"""
+"""The train stage: a scene in, a trained field out, and what `stages.artifacts.TrainOutputs` lists."""
 
 import json
-import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -30,12 +19,12 @@ from pipeline.stage import Job
 from stages.artifacts import TrainOutputs
 from stages.compiling import clock, compiling_kernels
 from stages.cores import use_all_cores
-from stages.io import field_file, refined_cameras, scene
-from stages.io.scene import Scene, View
+from stages.io import field_file, scene
+from stages.io.scene import Scene
 from stages.train.budget import UNKNOWN, Budget, training_budget
 from stages.train.checkpoints import Checkpoints
 from stages.train.checks.watch import Watch
-from stages.train.checks.wrong_views import cameras_of, draw_wrong_views, findings_of, left_out_of, train_and_check
+from stages.train.checks.wrong_views import findings_of, train_and_check, write_cameras
 from stages.train.data import begin_sky, count_pixels, depth_range, pixels_of, sparse_depth_of
 from stages.train.exposure import begin_exposure, exposure_facts, saved_exposure
 from stages.train.hash_resolution import with_auto_sizes
@@ -73,11 +62,11 @@ def trained(job: Job) -> bool:
     checkpoints = Checkpoints(job)
     spent = checkpoints.restore(t, settings.iterations if settings.time_budget == "off" else UNKNOWN)
     log = TrainLog(job.work / TrainOutputs.log, t.step, spent, AsyncOccupancy(m.voxels), clock)
-    render = FieldRenderer(m, near, far).colour
-    previews = Previews(render, m.background, folder, s, job.work, resolved(settings.preview_every))
+    renderer = FieldRenderer(m, near, far)
+    previews = Previews(renderer.colour, m.background, folder, s, job.work, resolved(settings.preview_every))
     previews.draw_when_due(t.step)
     budget = begin_budget(job, t, watch.seconds + spent + clock() - began)
-    fails = partial(watch.begins_again, render, pixels, partial(checkpoints.save, t, log))
+    fails = partial(watch.begins_again, renderer.colour, pixels, partial(checkpoints.save, t, log))
     if fails(t.step, t.schedule.iterations, log.seconds):
         return False
 
@@ -97,13 +86,11 @@ def trained(job: Job) -> bool:
             return False
         checkpoints.reach(t, log, every=settings.checkpoint_every, last=last)
         log.begin_step()
-    log.flush()
     field_file.save_model(m, near, far, outputs.field, saved_exposure(t.exposure, s), t.schedule)
-    write_cameras(outputs, t, views, folder, FieldRenderer(m, near, far))
+    write_cameras(outputs, t, views, folder, renderer)
     watch.write_choices(outputs.choices)
     write_report(outputs.report, job, t, log.seconds, previews.figures | watch.report() | {"wrong_views": findings_of(t, views)}, priors)
-    shutil.copyfile(log.path, outputs.log)
-    log.draw_curve(outputs.curve)
+    log.publish(outputs.log, outputs.curve)
     previews.publish(outputs.previews, job.warn)
     return True
 
@@ -134,13 +121,6 @@ def follow_budget(job: Job, t: Trainer, budget: Budget) -> None:
         t.schedule = budget.schedule
         rest = f" (so far: {before})" if known else ""
         job.say(f"{t.schedule.iterations} steps fit into the budget of {job.settings.time_budget} s{rest}")
-
-
-def write_cameras(outputs: TrainOutputs, t: Trainer, views: tuple[View, ...], folder: Path, renderer: FieldRenderer) -> None:
-    """The training cameras where some were replaced, the views that were left out, and pictures of both; `folder` is the scene's."""
-    if (cameras := cameras_of(t)) is not None:
-        refined_cameras.write(views, cameras, outputs.cameras, left_out_of(t, views))
-        draw_wrong_views(outputs.wrong_views, t, views, folder, renderer)
 
 
 def write_report(path: Path, job: Job, t: Trainer, seconds: float, found: dict[str, Any], priors: Sequence[Prior]) -> None:

@@ -1,8 +1,7 @@
 """The turntable stage: PNG frames, MP4 and EXR of the baked asset along an orbit."""
 
 import shutil
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from efficientnerf.asset import format
 from efficientnerf.asset.camera_paths import turntable_cameras
@@ -28,7 +27,7 @@ def run(job: Job) -> None:
     del whole
     remedy = f"Lower turntable.width ({s.width}) or turntable.height ({s.height})."
     refuse_what_does_not_fit(job, frames_needed(tree, s.width * s.height, job.device), remedy)
-    render_turntable(tree, job, cameras=cameras)
+    render_turntable(tree, job, cameras)
 
 
 def cameras_of(tree: NerfTree, s: TurntableSettings, warn: Warn = lambda text: None) -> list[Camera]:
@@ -42,17 +41,16 @@ def cameras_of(tree: NerfTree, s: TurntableSettings, warn: Warn = lambda text: N
     )  # fmt: skip
 
 
-def render_turntable(tree: NerfTree, job: Job, draw: Callable[..., Any] | None = None, cameras: Sequence[Camera] | None = None) -> None:
+def render_turntable(tree: NerfTree, job: Job, cameras: Sequence[Camera]) -> None:
     """Write frames and video, of the tree as it is. Frames are kept in job.work, so that a kill costs the last few at most; the video is made of the PNGs."""
     s: TurntableSettings = job.settings
-    cameras = cameras_of(tree, s) if cameras is None else cameras
     options = RenderOptions(background=s.background, supersample=s.supersample, exr=s.exr, fps=s.fps, crf=s.crf)
 
     def each(done: int, total: int) -> None:
         job.safe_point()
         job.progress(done, total, "frames")
 
-    written = render_frames(tree, cameras, job.work / "frames", options, each, reuse=True, draw=draw, warn=job.warn)
+    written = render_frames(tree, cameras, job.work / "frames", options, each, reuse=True, warn=job.warn)
     job.say("encoding the video")
     encode_frames([path for path in written if path.suffix == ".png"], TurntableOutputs(job.out).video, options, job.safe_point)
     for path in written:

@@ -124,4 +124,4 @@ def sharpness_sheet(files: Mapping[str, Path], sharpness: Mapping[str, float], b
         labels.append(f"{sharpness[name]:.2f}{' blurred' if name in set(blurred) else ''} {name}")
     if pictures:
         title = f"{len(ordered)} photographs by sharpness, the most blurred first; {len(blurred)} blurred"
-        grid_sheet(pictures, labels, path, thumbnail=160, title=title)
+        grid_sheet(pictures, labels, path, title=title)

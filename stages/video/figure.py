@@ -21,7 +21,7 @@ def write_frames_sheet(record: Sequence[Mapping[str, Any]], paths: Mapping[str, 
 
     record, paths  as of `stages.video.frames.Chosen`
     """
-    rows: list[list[np.ndarray | None]] = []
+    rows: list[list[np.ndarray]] = []
     labels: list[list[str]] = []
     for video in record:
         chosen = [place for place, verdict in enumerate(video["verdict"]) if verdict == CHOSEN]

@@ -168,7 +168,7 @@ def render(
     for k in range(len(cameras)):
         for kind in ("png", "exr"):
             check_free(out / f"frame_{k:04d}.{kind}", force=force, inputs=read)
-    options = RenderOptions(background=settings.background, supersample=settings.supersample, exr=settings.exr, video=None, fps=fps, crf=settings.crf)
+    options = RenderOptions(background=settings.background, supersample=settings.supersample, exr=settings.exr, fps=fps, crf=settings.crf)
     with display(as_json=as_json, quiet=quiet) as show:
         progress = _progress("render", show)
         with writing(out / "frame_0000.png", force=force):

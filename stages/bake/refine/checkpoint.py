@@ -1,8 +1,8 @@
-"""The checkpoint of a refinement in the bake's scratch folder: the state, how far it is, and where its voxels lie.
+"""The checkpoint of a refinement in the bake's scratch folder: the state, how far it is, and which voxels it has.
 
-What was baked gives the grids. A state's voxels are all of those that were baked in the first phase, and some of them in the second.
+A state's voxels are all of those that were baked in the first phase, and some of them in the second.
 
-N voxels, n voxels of the state.
+N voxels that were baked, n of the state.
 """
 
 import hashlib
@@ -16,7 +16,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from efficientnerf.asset.cascades import cascades_of, subset, voxel_cascades, voxel_coordinates
+from efficientnerf.asset.cascades import subset
 from efficientnerf.asset.refinement.schedule import RefinementSchedule, recorded_schedule
 from efficientnerf.asset.refinement.state import MOMENTS, STATE, RefinementState
 from efficientnerf.asset.tree import NerfTree
@@ -27,8 +27,6 @@ from stages.scratch import opened, unusable
 from stages.train.budget import schedule_state
 
 CHECKPOINT = "refinement.safetensors"
-
-
 _Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e10)]
 
 
@@ -51,6 +49,7 @@ class Point:
     schedule  of the steps
     phase     number of the one whose steps are taken
     pruned    what was dropped after the first; None in it
+    kept      (N,) bool, the voxels that were not dropped; None: all
     seconds   of the stage up to here
     began     seconds at which the phase began
     allotted  seconds that it may take, where there is a budget
@@ -60,6 +59,7 @@ class Point:
     schedule: RefinementSchedule
     phase: int = 0
     pruned: Pruned | None = None
+    kept: np.ndarray | None = None
     seconds: float = 0.0
     began: float = 0.0
     allotted: float = 0.0
@@ -70,21 +70,15 @@ def save(job: Job, point: Point) -> None:
     state = point.state
     state.fetch()
     tensors = {name: np.ascontiguousarray(getattr(state, name)) for name in STATE}
-    tensors["coordinates"] = voxel_coordinates(state.tree)
-    if state.tree.outer:
-        tensors["cascades"] = voxel_cascades(state.tree)
+    if point.kept is not None:
+        tensors["kept"] = point.kept
     if state.errors is not None:
         tensors["errors"] = state.errors
-    tensors["about"] = about_of(point)
+    times = (point.seconds, point.began, point.allotted)
+    about = _About(state.step, point.phase, point.pruned, point.schedule.state(), *times)
+    tensors["about"] = np.frombuffer(msgspec.json.encode(about), np.uint8)
     with atomic(job.work / CHECKPOINT, durable=False) as temporary:
         save_file(tensors, str(temporary), metadata={"sha256": digest_of(tensors)})
-
-
-def about_of(point: Point) -> np.ndarray:
-    """The checkpoint's metadata, as bytes of JSON."""
-    times = (point.seconds, point.began, point.allotted)
-    about = _About(point.state.step, point.phase, point.pruned, point.schedule.state(), *times)
-    return np.frombuffer(msgspec.json.encode(about), np.uint8)
 
 
 def digest_of(tensors: Mapping[str, np.ndarray]) -> str:
@@ -119,7 +113,7 @@ def restored(job: Job, tree: NerfTree, stated: RefinementSchedule, hold: int | N
         remove(path)
         return None
     job.say(f"resuming the refinement from step {state.step}")
-    return Point(state, schedule, about.phase, about.pruned, about.seconds, about.began, about.allotted)
+    return Point(state, schedule, about.phase, about.pruned, kept if "kept" in found else None, about.seconds, about.began, about.allotted)
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
@@ -146,38 +140,29 @@ def _errors(found: Mapping[str, np.ndarray], step: int, cells: int) -> np.ndarra
 
 
 def _with_values(tree: NerfTree, kept: np.ndarray, density: np.ndarray, sh: np.ndarray) -> NerfTree:
-    """The tree with the voxels `kept`, places of its own, alone, and their values."""
-    keep = np.zeros(len(tree.density_values), bool)
-    keep[kept] = True
-    structure = subset(replace(tree, harmonics=tree.sh[:, :0]), keep)  # harmonics are most of the memory: none are copied
+    """The tree with the voxels `kept`, (N,) bool, alone, and their values."""
+    structure = subset(replace(tree, harmonics=tree.sh[:, :0]), kept)  # harmonics are most of the memory: none are copied
     return replace(structure, density_values=density, harmonics=sh.reshape(len(sh), -1, 3))
-
-
-def _cascades(found: Mapping[str, np.ndarray]) -> np.ndarray:
-    """(n,) the cascade of each voxel."""
-    return found["cascades"] if "cascades" in found else np.zeros(len(found["coordinates"]), np.uint8)
 
 
 def check(
     found: Mapping[str, np.ndarray], tree: NerfTree, stated: RefinementSchedule, hold: int | None = None
 ) -> tuple[_About, RefinementSchedule, np.ndarray]:
-    """The checkpoint's metadata; the schedule; and the places in the tree of the state's voxels. ValueError where the tensors
-    are no state of a refinement of this tree, or a step in it is out of range."""
-    kinds = {"density": "float32", "sh": "float32", "square_density": "float32", "square_sh": "float32", "visits": "int32"}
-    count = len(found["density"]) if "density" in found and found["density"].ndim else 0
-    shapes = dict.fromkeys(kinds, (count,)) | {"sh": (count, 3 * tree.harmonics_count), "coordinates": (count, 3), "cascades": (count,)}
-    kinds |= {"coordinates": "int32"} | ({"cascades": "uint8"} if tree.outer else {})
-    for name, kind in kinds.items():
-        if name not in found or found[name].dtype != kind or found[name].shape != shapes[name]:
-            raise ValueError(f"'{name}' is missing, or no {kind} {shapes[name]}")
+    """The checkpoint's metadata; the schedule; and (N,) bool, which of the tree's voxels the state has. ValueError where the tensors are no state of a
+    refinement of this tree, or a step in it is out of range."""
     if "about" not in found or found["about"].dtype != "uint8" or found["about"].ndim != 1 or len(found["about"]) > 2**20:
         raise ValueError("'about' is missing, or no text")
     about = msgspec.json.decode(found["about"].tobytes(), type=_About)
-    schedule = _schedule_of(about, stated, hold)
-    place = places(tree, found["coordinates"], _cascades(found))
-    if not count or (np.diff(place) <= 0).any() or (count < len(tree.density_values) and about.phase == 0):
-        raise ValueError("its voxels are not those that were baked, in their order")
-    return about, schedule, place
+    baked = len(tree.density_values)
+    kept = found["kept"] if "kept" in found else np.ones(baked, bool)
+    if kept.dtype != bool or kept.shape != (baked,) or not kept.any() or (about.phase == 0 and not kept.all()) or kept.view(np.uint8).max() > 1:
+        raise ValueError("its voxels are not those that were baked")
+    count = int(kept.sum())
+    for name in STATE:
+        kind, shape = "int32" if name == "visits" else "float32", (count, 3 * tree.harmonics_count) if name == "sh" else (count,)
+        if name not in found or found[name].dtype != kind or found[name].shape != shape:
+            raise ValueError(f"'{name}' is missing, or no {kind} {shape}")
+    return about, _schedule_of(about, stated, hold), kept
 
 
 def _schedule_of(about: _About, stated: RefinementSchedule, hold: int | None) -> RefinementSchedule:
@@ -196,24 +181,3 @@ def _schedule_of(about: _About, stated: RefinementSchedule, hold: int | None) ->
     if not low <= about.step <= high:
         raise ValueError(f"step {about.step} is not from {low} to {high}")
     return schedule
-
-
-def places(tree: NerfTree, coordinates: np.ndarray, cascades: np.ndarray) -> np.ndarray:
-    """Which voxels of the tree lie at coordinates (n, 3) of their cascades (n,); ValueError where one of them is not stored."""
-    sizes = np.asarray([cascade.shape for cascade in cascades_of(tree)], np.int64) * tree.brick
-    if (cascades >= len(sizes)).any() or (coordinates < 0).any() or (coordinates >= sizes[cascades]).any():
-        raise ValueError("voxels outside of the grid")
-    first = np.cumsum([0, *sizes.prod(axis=1)])
-
-    def keys(at: np.ndarray, of: np.ndarray) -> np.ndarray:
-        side = sizes[of]
-        return first[of] + (at[:, 0].astype(np.int64) * side[:, 1] + at[:, 1]) * side[:, 2] + at[:, 2]
-
-    ours, theirs = keys(voxel_coordinates(tree), voxel_cascades(tree)), keys(coordinates, cascades)
-    order = np.argsort(ours)
-    if not len(ours):
-        raise ValueError("voxels of a tree that has none")
-    place = order[np.minimum(np.searchsorted(ours, theirs, sorter=order), len(ours) - 1)]
-    if not np.array_equal(ours[place], theirs):
-        raise ValueError("its voxels are not those that were baked, in their order")
-    return place

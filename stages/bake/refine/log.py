@@ -1,13 +1,12 @@
 """The log of a refinement, its previews of a view that was held back."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from efficientnerf.asset.refinement.state import RefinementState
 from stages.bake.refine.timing import Stopwatch
-from stages.train.log import continue_log, psnr_of
+from stages.train.log import Log, psnr_of
 from stages.train.previews import Previews
 
 EVERY = 10  # steps
@@ -16,28 +15,25 @@ PREVIEWS = 8  # after the first, which is drawn before a step is taken
 PREVIEW_SHARE = 0.03  # of the time, at most; the first and the last are drawn all the same
 
 
-class RefinementLog:
-    """log.jsonl: a line every few steps, and at each preview.
+class RefinementLog(Log):
+    """The log of a refinement: a line every few steps, and at each preview.
 
         seconds          of the stage so far
         psnr             running mean over the training rays, each over the backgrounds that it is compared over; null before the first step
         preview_psnr     of the preview, if one was drawn
         rays_per_second  of the steps alone, the mean since the last line
         resolution       voxels along the longest side
-
-    Lines are written by `flush`.
     """
 
     def __init__(self, path: Path, step: int, fraction: float, stopwatch: Stopwatch, previews: Previews, clock: Callable[[], float]) -> None:
         """
-        step, fraction  that the refinement goes on from; lines after it are dropped, for they will be logged again
+        step, fraction  that the refinement goes on from
         """
-        self.path, self.stopwatch, self.previews, self.clock = path, stopwatch, previews, clock
+        super().__init__(path, step)
+        self.stopwatch, self.previews, self.clock = stopwatch, previews, clock
         self.drawn = int(PREVIEWS * fraction)
         self.previewing, self.working, self.logged = 0.0, 0.0, step
         self.error: float | None = None
-        self.unwritten: list[str] = []
-        continue_log(path, step)
 
     def record(self, state: RefinementState, phase: str, fraction: float, rays: int, error: float, seconds: float, *, last: bool) -> dict[str, Any]:
         """Log a step where it is time; returns what a display shows of it.
@@ -58,7 +54,7 @@ class RefinementLog:
                 "psnr": psnr_of(self.error) if rays else None,
                 "rays": rays, "rays_per_second": round(rate), "voxels": len(state.density), "resolution": max(state.tree.resolution),
             }  # fmt: skip
-            self.unwritten.append(json.dumps(line, sort_keys=True))
+            self.add(line)
             self.working, self.logged = 0.0, state.step
         return {"psnr": round(psnr_of(self.error), 2), "voxels": len(state.density), **self.previews.figures}
 
@@ -79,8 +75,3 @@ class RefinementLog:
         self.drawn = due
         self.previewing += self.clock() - began
         return psnr
-
-    def flush(self) -> None:
-        with open(self.path, "a", encoding="utf-8") as file:
-            file.writelines(line + "\n" for line in self.unwritten)
-        self.unwritten.clear()

@@ -8,7 +8,6 @@ With bake.time_budget the number of steps of a phase follows from the time that 
 """
 
 import math
-import shutil
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -25,23 +24,24 @@ from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.training.patches import PatchGrid
+from efficientnerf.training.schedule import Schedule
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs
 from stages.bake import pruning
 from stages.bake.holes import find_holes
 from stages.bake.memory import needed_on_device
-from stages.bake.plan import Bake, SceneBake, coarse_cells
+from stages.bake.plan import Bake, coarse_cells
 from stages.bake.pruning import Pruned
 from stages.bake.refine import checkpoint
 from stages.bake.refine.checkpoint import Point
 from stages.bake.refine.log import RefinementLog
-from stages.bake.refine.timing import FINISH_SECONDS_PER_VOXEL, HOLD, WARMUP, WEIGHT_SECONDS, Stopwatch, allotted, clock, packing_seconds, timed_schedule
+from stages.bake.refine.timing import FINISH_SECONDS_PER_VOXEL, HOLD, WARMUP, WEIGHT_SECONDS, Stopwatch, allotted, clock, packing_seconds
 from stages.bake.voxels import Voxels
 from stages.cores import count_cores
 from stages.io.scene import Scene
-from stages.memory.device import free_on_device
-from stages.train.budget import Budget
-from stages.train.log import draw_curve, psnr_of
+from stages.memory.device import fits_on_device
+from stages.train.budget import UNKNOWN, Budget
+from stages.train.log import psnr_of
 from stages.train.previews import Previews
 
 CHECKPOINT_SECONDS = 30.0
@@ -83,7 +83,9 @@ class Refinement:
             self._begin_phase()
         if point.phase == 0:
             self._take_steps()
-            self._prune()
+            point.state, point.pruned, point.kept = pruning.prune(
+                self.job, self.scene, self.plan, point.state, self.targets, self.most, self.samples, self.baked
+            )
             point.phase = 1
             self._begin_phase()
             self._save()
@@ -98,7 +100,7 @@ class Refinement:
             return
         point.began = point.seconds = self.stopwatch.seconds
         point.allotted = allotted(point.phase, self.budget - point.began - (0.0 if point.phase else self._pruning_seconds()))
-        point.schedule = point.schedule.with_phase(point.phase, timed_schedule())
+        point.schedule = point.schedule.with_phase(point.phase, Schedule(UNKNOWN, HOLD))
 
     def _pruning_seconds(self) -> float:
         """About how many seconds it takes to find which voxels show."""
@@ -152,11 +154,6 @@ class Refinement:
         checkpoint.save(self.job, self.point)
         self.written = clock()
 
-    def _prune(self) -> None:
-        """Drop voxels that do not show."""
-        point = self.point
-        point.state, point.pruned = pruning.prune(self.job, self.scene, self.plan, point.state, self.targets, self.most, self.samples, self.baked)
-
 
 def refined(
     job: Job, s: Scene, plan: Bake, voxels: Voxels, tree: NerfTree, targets: Targets, stopwatch: Stopwatch
@@ -167,7 +164,7 @@ def refined(
     most = min(len(tree.density_values), capacity)
     steps = plan.refine_steps
     if steps is None:
-        steps = usual_steps(most, settings.refine_rays_per_batch, len(targets.pixels) if isinstance(plan, SceneBake) else None)
+        steps = usual_steps(most, settings.refine_rays_per_batch, len(targets.pixels) if plan.kind == "scene" else None)
     report: dict[str, Any] = {"psnr_before": None, "psnr_after": None, "voxels_baked": len(tree.density_values)}
     sample = min(ERROR_RAYS, 4 * len(targets.pixels))
     targets = targets_on_device(job, tree, targets)
@@ -179,8 +176,7 @@ def refined(
     per_ray = measuring / sample
     finish = measuring + FINISH_SECONDS_PER_VOXEL * most
     if plan.layout == "packed":
-        weighed = min(max(settings.visibility_rays, most), 4 * len(targets.pixels))
-        finish += packing_seconds(most, count_cores(), per_ray, settings.refine_rays_per_batch, weighed, sample)
+        finish += packing_seconds(most, count_cores(), per_ray, settings.refine_rays_per_batch)
     schedule = stated_schedule(steps) if seconds is None else RefinementSchedule()
     thickness = MAX_INITIAL_THICKNESS if steps else math.inf
     bare = replace(tree, harmonics=np.zeros((len(tree.density_values), 0, 3), np.float32))
@@ -202,7 +198,9 @@ def refined(
     job.record("schedule", point.schedule.state())
     if samples is not None:
         report["holes"] = _holes(job, tree, samples, point.pruned or Pruned())
-    _publish(job, log)
+    outputs = BakeOutputs(job.out)
+    log.publish(outputs.log, outputs.curve)
+    log.previews.publish(outputs.previews, job.warn)
     return tree, report
 
 
@@ -231,15 +229,6 @@ def _previews(job: Job, s: Scene, point: Point, targets: Targets) -> Previews:
     return Previews(seen, targets.background, job.inputs["poses"], s, job.work)
 
 
-def _publish(job: Job, log: RefinementLog) -> None:
-    """The log, its curve and the previews."""
-    outputs = BakeOutputs(job.out)
-    log.flush()
-    shutil.copyfile(log.path, outputs.log)
-    draw_curve(outputs.curve, log.path)
-    log.previews.publish(outputs.previews, job.warn)
-
-
 def _holes(job: Job, tree: NerfTree, samples: FieldSamples, pruned: Pruned) -> dict[str, Any]:
     """The entry of the report about holes, which is also a message."""
     holes = {**pruned.report(), "refined": round(find_holes(job, tree, samples)[1], 6)}
@@ -256,13 +245,8 @@ def targets_on_device(job: Job, tree: NerfTree, targets: Targets) -> Targets:
     needed += voxels * bool(tree.outer)  # the cascade of each voxel
     if targets.pixels.images is not None:
         needed += targets.pixels.images.nbytes
-    if job.device == "cpu" or needed <= (free := free_on_device(job.device)):
-        return targets.to(job.device)
-    job.warn(
-        f"refining {voxels:,} voxels needs about {needed / 2**30:.1f} GiB on the device; {free / 2**30:.1f} GiB are free."
-        " They are refined on the CPU, which takes longer. Lower bake.max_mib or bake.resolution to use the device."
-    )
-    return targets
+    fits = fits_on_device(job, needed, f"refining {voxels:,} voxels", "Lower bake.max_mib or bake.resolution")
+    return targets.to(job.device) if fits else targets
 
 
 def usual_steps(voxels: int, rays: int, pixels: int | None) -> int:

@@ -1,18 +1,14 @@
 """The shares of bake.time_budget that the phases of the refinement may take."""
 
 from efficientnerf.asset.refinement.schedule import PHASES
-from efficientnerf.training.schedule import Schedule
 from stages.compiling import clock
-from stages.train.budget import UNKNOWN
 
 # docs/experiments/refinement.md
 WARMUP, TIMED = 2, 8  # first steps of a phase that are not timed; those after them that are, before the number of its steps is set
 FINISH_SECONDS_PER_VOXEL = 3e-6  # that the palettes and the file take
-# Codes of the layout `packed` (docs/experiments/packed.md): at how many rates they are chosen at most, and are reckoned to be; what a rate takes, in seconds
-# of one core, and what comes before the first; the steps that tables are fitted in, and what a ray of a step takes, over one whose error is measured.
-PACKING_TRIES, PACKING_EXPECTED = 10, 3
-PACKING_SECONDS_PER_VOXEL, CLUSTERING_SECONDS_PER_VOXEL = 1e-5, 2e-6
-REFIT_STEPS, REFIT_ERRORS, STEP_SECONDS = 64, 8, 1.5
+# Codes of the layout `packed` (docs/experiments/packed.md): at how many rates they are chosen at most; seconds of one core that a voxel takes at the three that
+# are usual; the steps that tables are fitted in, and what a ray of a step takes, over one whose error is measured, with what is measured before and after.
+PACKING_TRIES, PACKING_SECONDS_PER_VOXEL, REFIT_STEPS, REFIT_SECONDS = 10, 3.2e-5, 64, 2.2
 WEIGHT_SECONDS = 0.8  # that a ray takes which is rendered for voxel weights, over one whose error is measured
 HOLD = WARMUP + TIMED
 
@@ -36,16 +32,10 @@ def allotted(phase: int, left: float) -> float:
     return max(0.0, left) * PHASES[phase].share / sum(one.share for one in PHASES[phase:])
 
 
-def packing_seconds(voxels: int, cores: int, per_ray: float, rays: int, weight_rays: int, error_rays: int) -> float:
+def packing_seconds(voxels: int, cores: int, per_ray: float, rays: int) -> float:
     """About how long codes of so many voxels take to choose, and their tables to fit (`stages.bake.economy`).
 
-    per_ray      seconds that measuring the error of a ray takes
-    rays         of a step; `weight_rays`, that voxels are weighed by; `error_rays`, that an error is measured by
+    per_ray  seconds that measuring the error of a ray takes
+    rays     of a step
     """
-    choosing = (PACKING_EXPECTED * PACKING_SECONDS_PER_VOXEL + CLUSTERING_SECONDS_PER_VOXEL) * voxels / cores
-    return choosing + per_ray * (REFIT_STEPS * rays * STEP_SECONDS + weight_rays * WEIGHT_SECONDS + REFIT_ERRORS * error_rays)
-
-
-def timed_schedule() -> Schedule:
-    """That of a phase whose number of steps is not known yet."""
-    return Schedule(UNKNOWN, HOLD)
+    return PACKING_SECONDS_PER_VOXEL * voxels / cores + per_ray * REFIT_STEPS * rays * REFIT_SECONDS

@@ -18,7 +18,7 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera
 from stages.evaluate.trivial import blurred
-from stages.evaluate.views import evenly_spaced, ground_truth, subsample_camera
+from stages.evaluate.views import evenly_spaced, ground_truth, stride_to, subsample_camera
 from stages.io.scene import Scene, View, views_of
 
 FRACTION = 0.1  # of the steps
@@ -84,7 +84,7 @@ def held_out_views(folder: Path, s: Scene) -> list[HeldOutView]:
 
 
 def _small(folder: Path, s: Scene, view: View) -> HeldOutView:
-    stride = max(1, math.ceil(max(view.camera.width, view.camera.height) / SIDE))
+    stride = stride_to(view.camera, SIDE)
     truth = ground_truth(folder, view, s.background, stride)
     subject = np.ones(truth.colour.shape[:2], bool) if truth.inside is None else truth.inside
     counted = cv2.dilate(subject.astype(np.uint8), np.ones((2 * MARGIN + 1,) * 2, np.uint8)).astype(bool)

@@ -91,11 +91,6 @@ def try_all(job: Job, s: Scene, settings: TrainSettings, pixels: Pixels, held: S
     return trials
 
 
-def finished(job: Job) -> list[Trial]:
-    """The trials that this run has finished, in their order."""
-    return [trial for path in sorted(job.work.glob("trial_*.json")) if (trial := noted(path, Trial, job.warn)) is not None]
-
-
 def best_of(trials: Sequence[Trial]) -> Trial | None:
     """The trial that is clearly better than what is stated; None: none is. Of those that are about as good the first: it changes least."""
     stated = next((trial for trial in trials if trial.name == AS_STATED), None)
@@ -120,7 +115,7 @@ def _train(
     exposure = begin_exposure(folder, s, own, small.exposure, job.device)
     for done in loop.train(loop.trainer(m, exposure, cameras=cameras), own, depth):
         job.reached(done.step, small.iterations, f"second chance, {name}")
-    return judge(held, lambda camera: FieldRenderer(m, near, far).colour(camera), small.iterations)
+    return judge(held, FieldRenderer(m, near, far).colour, small.iterations)
 
 
 def _small(settings: TrainSettings) -> TrainSettings:

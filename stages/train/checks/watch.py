@@ -20,7 +20,7 @@ from stages.io.scene import Scene
 from stages.scratch import note, noted
 from stages.train import budget
 from stages.train.checks.early_check import EarlyResult, check_step, held_out_views, judge
-from stages.train.checks.second_chances import best_of, finished, try_all
+from stages.train.checks.second_chances import Trial, best_of, try_all
 from stages.train.choices import TrainingChoices, write
 
 DECIDED = "second_chances.json"
@@ -33,11 +33,13 @@ class _Decision:
     chosen   name of the trial whose choices training begins again with; None: it goes on as it is
     choices  of that trial
     seconds  that were trained in vain
+    trials   all that were made, in their order
     """
 
     chosen: str | None
     choices: TrainingChoices
     seconds: float
+    trials: list[Trial]
 
 
 class Watch:
@@ -80,7 +82,7 @@ class Watch:
             due = check_step(iterations)
             if due is None or step < due:
                 return False
-            self._look(step, render)
+            self._judge(step, render)
         result = self.results[-1]
         if result is None or result.learning or self.decision is not None:
             return False
@@ -92,7 +94,7 @@ class Watch:
             save()
         return self._decide(pixels, seconds)
 
-    def _look(self, step: int, render: Callable[[Camera], np.ndarray]) -> None:
+    def _judge(self, step: int, render: Callable[[Camera], np.ndarray]) -> None:
         """Compare with the held-out views, and note what is found."""
         result = judge(held_out_views(self.folder, self.stated), render, step)
         if result is None:
@@ -101,14 +103,14 @@ class Watch:
         note(self.notes[-1], asdict(result))
         if result.learning:
             return
-        follows = {"retry": " Trying what has helped others." if not self.again else "", "continue": "", "stop": ""}
-        self.job.warn(f"{_in_words(result)}.{follows[self.job.settings.on_failure]}", early_check=asdict(result))
+        follows = " Trying what has helped others." if self.job.settings.on_failure == "retry" and not self.again else ""
+        self.job.warn(f"{_in_words(result)}.{follows}", early_check=asdict(result))
 
     def _decide(self, pixels: Pixels, seconds: float) -> bool:
         """Try second chances; whether one of them is clearly better."""
         trials = try_all(self.job, self.stated, self.job.settings, pixels, held_out_views(self.folder, self.stated))
         best = best_of(trials)
-        self.decision = _Decision(None, TrainingChoices(), seconds) if best is None else _Decision(best.name, best.choices, seconds)
+        self.decision = _Decision(None, TrainingChoices(), seconds, trials) if best is None else _Decision(best.name, best.choices, seconds, trials)
         if best is None:
             self.job.warn(f"none of {len(trials) - 1} second chances is clearly better than the given settings; training continues. {REMEDY}")
         else:
@@ -131,12 +133,10 @@ class Watch:
 
     def report(self) -> dict[str, Any]:
         """For report.json, and the manifest."""
-        trials = [] if self.decision is None else finished(self.job)
-        checks = [noted(path, EarlyResult, self.job.warn) for path in self.notes]
-        table = [{"name": trial.name, **asdict(trial.result)} for trial in trials]
+        trials = [] if self.decision is None else self.decision.trials
         return {
-            "early_check": [asdict(check) | {"learning": check.learning} for check in checks if check is not None],
-            "second_chances": table,
+            "early_check": [asdict(check) | {"learning": check.learning} for check in self.results if check is not None],
+            "second_chances": [{"name": trial.name, **asdict(trial.result)} for trial in trials],
             "chosen": None if self.decision is None else self.decision.chosen,
         }
 

@@ -16,10 +16,11 @@ from efficientnerf.training.sparse_depth import SparseDepthRays
 from efficientnerf.training.view_checks.checks import Observations, ViewChecks, check, is_due
 from pipeline.stage import Job
 from pipeline.text import printable
-from stages.evaluate.views import ground_truth, subsample_camera
+from stages.artifacts import TrainOutputs
+from stages.evaluate.views import ground_truth, stride_to, subsample_camera
 from stages.figures.plots import to_uint8
+from stages.io import refined_cameras
 from stages.io.png import write_png
-from stages.io.refined_cameras import as_trained
 from stages.io.scene import Scene, View, read_points, views_of
 
 SIDE = 300  # of a photograph in the picture, pixels
@@ -62,7 +63,7 @@ def scene_of(c: ViewChecks | None, s: Scene, views: tuple[View, ...]) -> Scene:
     """The scene as it is trained on: without the views that are left out, with the cameras that were replaced."""
     if c is None or not c.changed:
         return s
-    return as_trained(s, *_replaced_and_left_out(c, views))
+    return refined_cameras.as_trained(s, *_replaced_and_left_out(c, views))
 
 
 def _replaced_and_left_out(c: ViewChecks, views: tuple[View, ...]) -> tuple[dict[str, Camera], list[str]]:
@@ -84,16 +85,6 @@ def observations(folder: Path, s: Scene) -> Observations | None:
     return Observations(points.xyz[point], points.rgb[point] / 255, view[view >= 0]) if len(point) else None
 
 
-def left_out_of(t: Trainer, views: tuple[View, ...]) -> list[str]:
-    """The images of the views that were left out."""
-    return [] if t.checks is None else _replaced_and_left_out(t.checks, views)[1]
-
-
-def cameras_of(t: Trainer) -> list[Camera] | None:
-    """The cameras of the training views where these are not all trained on as they came; else None."""
-    return t.checks.cameras if t.checks is not None and t.checks.changed else None
-
-
 def findings_of(t: Trainer, views: tuple[View, ...]) -> list[dict[str, Any]]:
     """The findings on each view that was left out at some time: errors are shares of the photograph's variance inside tiles."""
     if t.checks is None:
@@ -110,17 +101,26 @@ def findings_of(t: Trainer, views: tuple[View, ...]) -> list[dict[str, Any]]:
     return found
 
 
-def draw_wrong_views(path: Path, t: Trainer, views: tuple[View, ...], folder: Path, renderer: FieldRenderer) -> None:
+def write_cameras(outputs: TrainOutputs, t: Trainer, views: tuple[View, ...], folder: Path, renderer: FieldRenderer) -> None:
+    """The training cameras where some were replaced, the views that were left out, and pictures of both; `folder` is the scene's."""
+    if t.checks is None or not t.checks.changed:
+        return
+    refined_cameras.write(views, t.checks.cameras, outputs.cameras, _replaced_and_left_out(t.checks, views)[1])
+    _draw(outputs.wrong_views, t.checks, t.model.background, views, folder, renderer)
+
+
+def _draw(
+    path: Path, c: ViewChecks, background: tuple[float, float, float] | None, views: tuple[View, ...], folder: Path, renderer: FieldRenderer
+) -> None:
     """Rows of photograph and render by the camera as it was given, and by the pose that was found where there is one; no file where no view is concerned."""
-    c = t.checks
-    if c is None or not (c.left_out | c.replaced).any():
+    if not (c.left_out | c.replaced).any():
         return
     rows = []
     for n in np.flatnonzero(c.left_out | c.replaced)[:ROWS]:
-        stride = max(1, math.ceil(max(views[n].camera.width, views[n].camera.height) / SIDE))
+        stride = stride_to(views[n].camera, SIDE)
         cameras = [c.given[n], *([replace(c.given[n], world_from_camera=c.pose[n])] if c.replaced[n] else [])]
         renders = [np.clip(renderer.colour(subsample_camera(camera, stride)), 0, 1) for camera in cameras]
-        rows.append(np.concatenate([ground_truth(folder, views[n], t.model.background, stride).colour, *renders], axis=1))
+        rows.append(np.concatenate([ground_truth(folder, views[n], background, stride).colour, *renders], axis=1))
     height, width = sum(len(row) for row in rows), max(row.shape[1] for row in rows)
     sheet, top = np.ones((height, width, 3)), 0
     for row in rows:

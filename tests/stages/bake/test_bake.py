@@ -4,7 +4,7 @@ import dataclasses
 import hashlib
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,26 +31,19 @@ from stages.io.field_file import load_renderer, save_model
 from stages.io.scene import load
 from stages.train import run as train
 from tests.efficientnerf.balls import settings
-from tests.stages.balls import ORBIT, SIMILARITY, StopAt, job, poses
+from tests.stages.balls import ORBIT, SIMILARITY, StopAt, job
 from tests.stages.spoilers import SPOILERS
 
 TWELVE = stated_schedule(12)
 QUICK = BakeSettings(resolution=24, samples_per_voxel=4, licence="CC0-1.0", refine_steps=12, refine_rays_per_batch=512, lr_final_ratio=0.3)
 
 
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    folder = tmp_path_factory.mktemp("bake")
-    scene = poses(folder / "poses")
-    train.run(job(folder / "train", settings(iterations=30, sample_batch_size=4096, occupancy_warmup_steps=10), poses=scene))
-    return {"poses": scene, "train": folder / "train" / "out"}
-
-
-@pytest.fixture(autouse=True)
-def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(baking, "POINTS_PER_BLOCK", 8192)
-    monkeypatch.setattr(baking, "RAYS_PER_BLOCK", 512)
-    monkeypatch.setattr("stages.train.log.curve", lambda path, *_, **__: path.write_bytes(b""))
+@pytest.fixture(scope="module", autouse=True)
+def small_blocks() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(baking, "POINTS_PER_BLOCK", 8192)
+        patch.setattr(baking, "RAYS_PER_BLOCK", 512)
+        yield
 
 
 def run(made: Job) -> str:
@@ -61,12 +54,9 @@ def run(made: Job) -> str:
 @pytest.fixture(scope="module")
 def undisturbed(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Job, int]:
     """The digest, the job, and how often it could have been stopped."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(baking, "POINTS_PER_BLOCK", 8192)
-        patch.setattr(baking, "RAYS_PER_BLOCK", 512)
-        never = StopAt()
-        made = job(tmp_path_factory.mktemp("undisturbed"), QUICK, stop=never, **inputs)
-        return run(made), made, never.count
+    never = StopAt()
+    made = job(tmp_path_factory.mktemp("undisturbed"), QUICK, stop=never, **inputs)
+    return run(made), made, never.count
 
 
 def test_more_voxels_than_fit_into_memory_are_refused_before_they_are_baked(inputs: dict[str, Path], tmp_path: Path) -> None:
@@ -101,11 +91,8 @@ def test_stopped_anywhere_it_ends_in_the_same_bytes(inputs: dict[str, Path], tmp
 def stopped(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory, undisturbed: tuple[str, Job, int]) -> Path:
     """The scratch of a bake that was stopped at its last safe point."""
     folder = tmp_path_factory.mktemp("stopped")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(baking, "POINTS_PER_BLOCK", 8192)
-        patch.setattr(baking, "RAYS_PER_BLOCK", 512)
-        with pytest.raises(Interrupted):
-            run(job(folder, QUICK, stop=StopAt(undisturbed[2]), **inputs))
+    with pytest.raises(Interrupted):
+        run(job(folder, QUICK, stop=StopAt(undisturbed[2]), **inputs))
     return folder / "work"
 
 
@@ -160,8 +147,9 @@ CHANGES: list[Callable[[dict[str, np.ndarray]], object]] = [
     said(-1), said(10**9), said(7), said(2, 1), said(3, 7), said(8, 1, pruned=None),
     said(3, pruned=3), said(3, schedule=[]), said(3, more=1), said(3, seconds=-1.0),
     replaced("square_sh", lambda v: v[:-1]), replaced("visits", lambda v: v.astype(np.float32)),
-    replaced("coordinates", lambda v: v + 1), replaced("coordinates", lambda v: v - 1), replaced("coordinates", lambda v: v[::-1]),
-    replaced("coordinates", lambda v: v[:1] + 0 * v), replaced("sh", lambda v: v[:, :-3]), replaced("density", lambda v: v[..., None]),
+    replaced("kept", lambda v: v[:-1]), replaced("kept", lambda v: v.astype(np.uint8)), replaced("kept", lambda v: 0 * v > 0),
+    replaced("kept", lambda v: np.arange(len(v)) != 0), replaced("kept", lambda v: (2 * v.view(np.uint8)).view(bool)),
+    replaced("sh", lambda v: v[:, :-3]), replaced("density", lambda v: v[..., None]),
     lambda tensors: tensors.pop("about"), replaced("about", lambda v: v[:-1]), replaced("about", lambda v: v.astype(np.int8)),
 ]  # fmt: skip
 
@@ -170,10 +158,10 @@ CHANGES: list[Callable[[dict[str, np.ndarray]], object]] = [
 def test_a_state_of_another_refinement_is_told(pruned: int) -> None:
     indices = np.stack(np.meshgrid(*[np.arange(2, 6)] * 3, indexing="ij"), -1).reshape(-1, 3)
     tree = tree_from_voxels((2, 2, 2), 0.25, np.full(3, -1.0), indices, np.full(64, 40.0), np.zeros((64, 1, 3)), background=(1.0, 1.0, 1.0))
-    coordinates = voxel_coordinates(tree)[:: 1 + pruned]
-    count = len(coordinates)
+    kept = np.arange(64) % (1 + pruned) == 0
+    count = int(kept.sum())
     tensors = {name: np.zeros(count, np.float32) for name in ("density", "square_density", "square_sh")}
-    tensors |= {"sh": np.zeros((count, 3), np.float32), "visits": np.zeros(count, np.int32), "coordinates": coordinates}
+    tensors |= {"sh": np.zeros((count, 3), np.float32), "visits": np.zeros(count, np.int32), "kept": kept}
     tensors["about"] = about(7 if pruned else 3, pruned)
     checkpoint.check(tensors, tree, TWELVE)
     for change in CHANGES:

@@ -12,7 +12,6 @@ from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.spaces import NdcSpace
 from stages.artifacts import BakeOutputs
 from stages.bake import run as bake
-from stages.bake.plan import NdcBake
 from stages.bake.pruning import RAYS_PER_VOXEL
 from stages.bake.settings import BakeSettings
 from stages.io.field_file import load_renderer
@@ -65,6 +64,6 @@ def test_the_fit_takes_deep_voxels_to_the_photographs(inputs: dict[str, Path], t
     fitted = json.loads((tmp_path / "out" / "report.json").read_text())["optimisation"]
     assert fitted["psnr_after"] > fitted["psnr_before"] + 0.5
     looked = {event["total"] for event in told if event.get("text") == "rendering for voxel weights"}
-    assert looked == {min(int(RAYS_PER_VOXEL[NdcBake] * fitted["voxels_baked"]), 4 * 8 * 32 * 24)}
+    assert looked == {min(int(RAYS_PER_VOXEL["ndc"] * fitted["voxels_baked"]), 4 * 8 * 32 * 24)}
     assert max(looked) > 1000
     assert not [event for event in told if event["event"] == "warning"]

@@ -104,10 +104,11 @@ def test_what_few_views_show_is_dropped_last(
     weights = np.random.default_rng(3).uniform(0, 2 * THRESHOLD, len(few)).astype(np.float32)
     monkeypatch.setattr(pruning, "greatest_weights", lambda *_: weights.copy())
     plan = bake_plan(BakeSettings(), model(space_of(s), settings(), None), s, "cpu", 2)
-    state, _ = pruning.prune(made(tmp_path), s, plan, initial_state(tree), None, most)  # type: ignore[arg-type]
+    state, _, kept = pruning.prune(made(tmp_path), s, plan, initial_state(tree), None, most)  # type: ignore[arg-type]
     counted = np.where(few, FEW_VIEWS_RATIO, 1) * weights
     keep = counted > THRESHOLD
     if keep.sum() > most:
         keep &= counted >= np.sort(counted)[-most]
     assert (keep & few).any()
+    np.testing.assert_array_equal(kept, keep)
     assert {tuple(at) for at in voxel_coordinates(state.tree)} == {tuple(at) for at in coordinates[keep]}

@@ -17,28 +17,14 @@ from stages.bake import pruning
 from stages.bake import run as bake
 from stages.bake.refine import refinement
 from stages.bake.settings import BakeSettings
-from stages.train import run as train
-from tests.efficientnerf.balls import settings
-from tests.stages.balls import job, poses
+from stages.train.previews import Previews
+from tests.stages.balls import job
 
 QUICK = BakeSettings(resolution=24, samples_per_voxel=1, visibility_rays=1000, refine_rays_per_batch=64, refine_steps=8)
 
 
 class Killed(Exception):
     """What a kill leaves behind is what was written before it, as with any error outside of a safe point."""
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    folder = tmp_path_factory.mktemp("bake")
-    scene = poses(folder / "poses")
-    train.run(job(folder / "train", settings(iterations=20, sample_batch_size=2048, occupancy_warmup_steps=10), poses=scene))
-    return {"poses": scene, "train": folder / "train" / "out"}
-
-
-@pytest.fixture(autouse=True)
-def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stages.train.log.curve", lambda path, *_, **__: path.write_bytes(b""))
 
 
 def run(made: Job) -> str:
@@ -77,7 +63,7 @@ KILLS: dict[str, Callable[[pytest.MonkeyPatch], None]] = {
     "once voxels are dropped": lambda patch: after(pruning, "prune", patch),
     "first step after that": lambda patch: at_step(3, patch),
     "in the second phase": lambda patch: at_step(6, patch),
-    "at the end": lambda patch: after(refinement, "_publish", patch),
+    "at the end": lambda patch: after(Previews, "publish", patch),
 }
 
 

@@ -21,21 +21,11 @@ from stages.bake import run as bake
 from stages.bake.refine import refinement, timing
 from stages.bake.resolution import MAX_MIB, timed_mib
 from stages.bake.settings import BakeSettings
-from stages.train import run as train
 from stages.train.log import read_lines
-from tests.efficientnerf.balls import settings
-from tests.stages.balls import StopAt, job, poses
+from tests.stages.balls import StopAt, job
 
 SECONDS = 60.0
 QUICK = BakeSettings(resolution=16, samples_per_voxel=1, visibility_rays=1000, refine_rays_per_batch=64, time_budget=SECONDS)
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    folder = tmp_path_factory.mktemp("bake")
-    scene = poses(folder / "poses")
-    train.run(job(folder / "train", settings(iterations=20, sample_batch_size=2048, occupancy_warmup_steps=10), poses=scene))
-    return {"poses": scene, "train": folder / "train" / "out"}
 
 
 @pytest.fixture(autouse=True)
@@ -58,7 +48,6 @@ def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         monkeypatch.setattr(module, "clock", lambda: time[0])
     monkeypatch.setattr(fit, "optimise", timed)
     monkeypatch.setattr(fit, "max_weights", weighed)
-    monkeypatch.setattr("stages.train.log.curve", lambda path, *_, **__: path.write_bytes(b""))
     return time
 
 

@@ -71,6 +71,7 @@ def test_it_is_what_the_stage_says_that_it_needs(run: tuple[Path, dict[str, int]
     with pytest.raises(TooLittleMemory) as caught:
         MODULES[stage].run(short)
     assert memory_needed(stage, place, (), OWN) == caught.value.needed
+    assert not list(short.out.iterdir())
 
 
 def test_training_and_baking_take_no_more_than_was_predicted(run: tuple[Path, dict[str, int], Any]) -> None:

@@ -66,13 +66,3 @@ def test_they_are_trained_on_and_baked_under_a_limit_of_the_system(photographs: 
         made = json.loads((tmp_path / "run" / stage / "manifest.json").read_text(encoding="utf-8"))
         stated = made["facts"]["memory"]
         assert made["peak_memory"] <= stated["needed"] <= stated["limit"] < LIMIT
-
-
-@pytest.mark.slow
-def test_where_not_one_of_them_fits_the_run_is_refused(photographs: Path, tmp_path: Path) -> None:
-    """Before any is decoded."""
-    command = [sys.executable, "-m", "workflows.cli.main", "run", str(photographs), "--out", str(tmp_path / "run"), "--preset", "tiny", "--until", "poses"]
-    done = subprocess.run([*command, "--memory", "200m"], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert "poses: needs about" in done.stderr
-    assert not (tmp_path / "run/poses").exists()

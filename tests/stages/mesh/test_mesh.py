@@ -8,10 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from efficientnerf.asset import format
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.geometry.orbit import Orbit
+from efficientnerf.surface import isosurface
+from efficientnerf.surface import volume as volumes
 from efficientnerf.surface.mesh import Mesh
 from pipeline.errors import UsageError
 from pipeline.stage import Job
@@ -65,9 +68,6 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_mesh_lies_in_the_captures_frame(ball: Path, photographed: Path, tmp_path: Path) -> None:
-    import trimesh
-    from PIL import Image
-
     events: list[dict] = []
     settings = MeshSettings(max_faces=4000, density_threshold=150.0, texture_size=256)
     stage.run(Job(settings=settings, inputs=inputs(ball, photographed), out=tmp_path / "out", work=tmp_path / "work", report=events.append))
@@ -150,7 +150,7 @@ def test_the_foreground_is_meshed_unless_all_is_asked_for(ball: Path, photograph
 def test_the_texture_shows_what_was_asked_for(ball: Path, tmp_path: Path, choice: str, above: tuple[float, ...]) -> None:
     poses = photograph_ball(tmp_path / "poses", ((0.2, 0.9, 0.3), (0.9, 0.1, 0.4)))
     tree = format.load(ball / "asset.nerftree")
-    surface = stage.mesh_of(tree, MeshSettings(max_faces=2000), lambda *each: None)
+    surface, _ = stage.mesh_of(tree, MeshSettings(max_faces=2000), lambda *each: None)
     found = textured(surface, tree, (poses, poses), choice, 256, lambda *each: None)
     side = len(found.texture.colours)
     u, v = found.texture.coordinates.mean(1).T
@@ -184,3 +184,10 @@ def test_the_preview_shows_all_of_a_subject_that_is_clipped() -> None:
     assert whole.shape == middle.shape == (840, 1680, 3)
     assert (whole == (255, 0, 0)).all(-1).sum() > 1000
     assert not (middle == (255, 0, 0)).all(-1).any()
+
+
+def test_enclosed_space_is_found_with_any_number_of_bricks_at_once(ball: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    volume = volumes.volume_of(format.load(ball / "asset.nerftree"))
+    whole = isosurface.enclosed_cells(volume, 1e-3, np.zeros((0, 3)))
+    monkeypatch.setattr(volumes, "VOXELS_AT_ONCE", 1)
+    assert np.array_equal(isosurface.enclosed_cells(volume, 1e-3, np.zeros((0, 3))), whole)

@@ -45,7 +45,6 @@ def made_time(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(train, "clock", lambda: now[0])
     monkeypatch.setattr("stages.train.checks.wrong_views.train", timed)
-    monkeypatch.setattr("stages.train.log.curve", lambda path, *_, **__: path.write_bytes(b""))
 
 
 def report(made: Job) -> dict[str, Any]:

@@ -24,21 +24,14 @@ QUICK: dict[str, Any] = {"iterations": 9, "checkpoint_every": 4, "sample_batch_s
 Tensors, About = dict[str, torch.Tensor], dict[str, Any]
 
 
-@pytest.fixture(autouse=True)
-def no_curve(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stages.train.log.curve", lambda path, *_, **__: path.write_bytes(b""))
-
-
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, str]:
     """A scene, the scratch of a run that was stopped after step 6, and the digest of the field of one that was not."""
     folder = tmp_path_factory.mktemp("stopped")
     scene = poses(folder / "poses")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("stages.train.log.curve", lambda path, *_, **__: path.write_bytes(b""))
-        whole = run(folder / "whole", scene)[0]
-        with pytest.raises(Interrupted):
-            train.run(job(folder / "cut", settings(**QUICK), poses=scene, stop=StopAt(6)))
+    whole = run(folder / "whole", scene)[0]
+    with pytest.raises(Interrupted):
+        train.run(job(folder / "cut", settings(**QUICK), poses=scene, stop=StopAt(6)))
     return scene, folder / "cut" / "work", whole
 
 

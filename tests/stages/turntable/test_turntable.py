@@ -12,11 +12,13 @@ import pytest
 
 from efficientnerf.asset import format
 from efficientnerf.asset.camera_paths import turntable_cameras
+from efficientnerf.asset.tree import Region, tree_from_voxels
 from efficientnerf.evaluation.metrics import psnr
 from pipeline.errors import Interrupted
 from pipeline.stage import Job
+from stages.figures import frames as figures
 from stages.io.png import read_png
-from stages.turntable.run import render_turntable
+from stages.turntable.run import cameras_of, render_turntable
 from stages.turntable.settings import STAGE, TurntableSettings
 from tests.fakes import BallTree
 from tests.stages.spoilers import SPOILERS
@@ -40,9 +42,27 @@ def job_in(folder: Path, out: str = "out", settings: TurntableSettings = SETTING
     return Job(settings=settings, out=folder / out, work=folder / "work", **more)
 
 
+def rendered(job: Job, tree: BallTree = BallTree()) -> Job:  # noqa: B008 (frozen)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "render", lambda tree, camera, **options: tree.render(camera, **options))
+        render_turntable(tree, job, cameras_of(tree, job.settings))
+    return job
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The digests of an undisturbed turntable."""
+    return digests(rendered(job_in(tmp_path_factory.mktemp("whole"))).out)
+
+
+def stopped(folder: Path, moment: int) -> None:
+    asked = iter(range(100))
+    with pytest.raises(Interrupted):
+        rendered(job_in(folder, "first", stop=lambda: 2 if next(asked) >= moment else None))
+
+
 def test_it_writes_frames_a_video_of_them_and_one_exr(tmp_path: Path) -> None:
-    job = job_in(tmp_path)
-    render_turntable(BallTree(), job, BallTree.render)
+    job = rendered(job_in(tmp_path))
     assert sorted(digests(job.out)) == ["frame_0000.exr", *(f"frame_000{k}.png" for k in range(5)), "turntable.mp4"]
     frames = [read_png(job.out / f"frame_000{k}.png") for k in range(5)]
     assert all(frame.shape == (48, 64, 3) for frame in frames)
@@ -61,38 +81,24 @@ def test_it_writes_frames_a_video_of_them_and_one_exr(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("moment", [1, 3, 6, 8])
-def test_a_stop_anywhere_and_going_on_gives_the_same_bytes(tmp_path: Path, moment: int) -> None:
-    whole = job_in(tmp_path / "whole")
-    render_turntable(BallTree(), whole, BallTree.render)
-    asked = iter(range(100))
-    with pytest.raises(Interrupted):
-        render_turntable(BallTree(), job_in(tmp_path, "first", stop=lambda: 2 if next(asked) >= moment else None), BallTree.render)
+def test_a_stop_anywhere_and_going_on_gives_the_same_bytes(whole: dict[str, str], tmp_path: Path, moment: int) -> None:
+    stopped(tmp_path, moment)
     CountingTree.calls = 0
-    job = job_in(tmp_path, "second")
-    render_turntable(CountingTree(), job, CountingTree.render)
-    assert digests(job.out) == digests(whole.out)
+    assert digests(rendered(job_in(tmp_path, "second"), CountingTree()).out) == whole
     assert CountingTree.calls == max(0, 5 - moment), "finished frames are not drawn again"
 
 
 @pytest.mark.parametrize(("how", "suffix"), [("cut", ".png"), ("zero", ".exr"), ("link", ".png"), ("half zero", ".json")])
-def test_every_scratch_file_of_a_turntable_may_be_damaged(tmp_path: Path, suffix: str, how: str) -> None:
-    whole = job_in(tmp_path / "whole")
-    render_turntable(BallTree(), whole, BallTree.render)
-    asked = iter(range(100))
-    with pytest.raises(Interrupted):
-        render_turntable(BallTree(), job_in(tmp_path, "first", stop=lambda: 2 if next(asked) >= 3 else None), BallTree.render)
+def test_every_scratch_file_of_a_turntable_may_be_damaged(whole: dict[str, str], tmp_path: Path, suffix: str, how: str) -> None:
+    stopped(tmp_path, 3)
     for path in sorted((tmp_path / "work" / "frames").glob(f"*{suffix}")):
         SPOILERS[how](path)
     events: list[dict[str, Any]] = []
-    job = job_in(tmp_path, "second", report=events.append)
-    render_turntable(BallTree(), job, BallTree.render)
-    assert digests(job.out) == digests(whole.out)
+    assert digests(rendered(job_in(tmp_path, "second", report=events.append)).out) == whole
     assert [event["text"].partition(" ")[0] for event in events if event["event"] == "warning"] == ["frame_0000.json"]
 
 
 def test_the_foreground_is_shown_unless_all_is_asked_for_and_framed_in_both(tmp_path: Path) -> None:
-    from efficientnerf.asset.tree import Region, tree_from_voxels
-
     indices = np.stack(np.meshgrid(*[np.arange(16)] * 3, indexing="ij"), -1).reshape(-1, 3)
     tree = tree_from_voxels((4, 4, 4), 0.125, np.full(3, -1.0), indices, np.full(len(indices), 400.0), np.zeros((len(indices), 1, 3)))
     (tmp_path / "bake").mkdir()
