@@ -30,8 +30,8 @@ def check_cameras(tree: NerfTree) -> tuple[list[Camera], list[Camera]]:
     or of a turntable between those."""
     captured, longer = captured_of(tree.metadata), min(LONGER_SIDE, PIXELS_PER_VOXEL * max(tree.resolution))
     if captured is None:
-        size = {"width": longer, "height": max(1, 3 * longer // 4)}
-        return turntable_cameras(tree, frames=ORBIT, **size), turntable_cameras(tree, frames=2 * ORBIT, **size)[1::2]
+        few, many = (turntable_cameras(tree, frames=count, width=longer, height=max(1, 3 * longer // 4)) for count in (ORBIT, 2 * ORBIT))
+        return few, many[1::2]
     cameras = captured.cameras(longer / max(captured.width, captured.height))
     chosen = np.unique(np.linspace(0, len(cameras) - 1, CAPTURED).round().astype(int))
     left = np.setdiff1d(np.arange(len(cameras)), chosen)
