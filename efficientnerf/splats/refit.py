@@ -1,21 +1,22 @@
 """Gaussians fitted to pictures: Adam on means, scales, rotations, opacities and harmonics.
 
-A step takes a picture, or rows of a large one with about PIXELS. It minimises the squared error, for a picture with alpha over all backgrounds
-at once, and 1 - SSIM of windows of 4 x 4 pixels, which begin at another corner in each step. Noise on the means and opacities that fade, after
-3DGS-MCMC, keep few photographs from being overfitted. The order of the pictures, the rows, the corner and the noise are drawn by (seed, step).
-On the CPU the same pictures give the same bytes, on any number of threads.
+A step takes a picture, or rows of a large one with about PIXELS; the first steps take large pictures at half their size. It minimises the
+squared error, for a picture with alpha over all backgrounds at once, and 1 - SSIM of windows of 4 x 4 pixels, which begin at another corner in
+each step. Noise on the means and opacities that fade, after 3DGS-MCMC, keep few photographs from being overfitted. The order of the pictures,
+the rows, the corner and the noise are drawn by (seed, step). On the CPU the same pictures give the same bytes, on any number of threads.
 """
 
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from efficientnerf.backends.dispatch import splats_on
 from efficientnerf.backends.layout import SSIM_WINDOW
 from efficientnerf.backends.splat_layout import DRAWS, GRADIENTS, LANES, OPACITY, ROTATION, SCALE, TILE, Lens, Picture, Rates, SplatState
-from efficientnerf.geometry.cameras import Camera, rows_of
+from efficientnerf.geometry.cameras import Camera, resized, rows_of
 from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
 from efficientnerf.splats.rendering import LOG_SCALES, gaussians_from, lens_of, values_of
 
@@ -25,6 +26,7 @@ MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, HARMONICS = 0.1, 0.06, 0.02, 0.05,
 HARMONICS_PER_VIEW, LEAST_HARMONICS, MOST_HARMONICS = 1 / 320, 0.25, 0.75
 STRUCTURE = 0.005  # of `Picture`
 PIXELS = 2**18  # of a step
+COARSE_UNTIL, COARSE_PIXELS = 0.3, 2**17  # of the steps: until then, pictures of so many pixels and more are taken at half their size
 LAST_RATE = 0.1  # of the learning rates, at the last step
 MOMENTUM, DECAY, EPSILON = 0.9, 0.99, 1e-6
 NOISE = 0.05  # of `Rates`, at the first step
@@ -92,11 +94,14 @@ def refitted(
         times = times[due:]
         if due and number and most:
             fit = begin(*_divided(fit.state(), most, relocated), gaussians.degree, device)
+        done = max(number / max(steps - 1, 1), used)
         whole = views[order.pop()]
+        if done < COARSE_UNTIL and whole.camera.width * whole.camera.height >= COARSE_PIXELS:
+            whole = _half(whole)
         view = _band(whole, np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 6, number])))
         corner = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 9, number])).integers(SSIM_WINDOW, size=2)
         lens, picture = _moved(lens_of(view.camera, whole.camera), _picture(view, background), *corner.tolist())
-        fit.step(lens, picture, rates_of(max(number / max(steps - 1, 1), used), harmonics, fade, seed, number))
+        fit.step(lens, picture, rates_of(done, harmonics, fade, seed, number))
         if reached is not None:
             reached(number + 1)
     fitted = gaussians_from(fit.state().rows)
@@ -133,6 +138,22 @@ def _divided(state: SplatState, most: int, relocated: float = 0.0) -> tuple[np.n
     parts[here, SCALE + longest] += np.log(SPLIT_SHARE)
     rows[halves] = parts
     return rows, moments
+
+
+def _half(view: View) -> View:
+    """The view at half its size, each pixel the mean of four, by their alpha; it counts where all of them do."""
+    size = view.camera.width // 2, view.camera.height // 2
+    pixels, mask = view.pixels, view.mask
+    if pixels.shape[2] == 4:
+        alpha = pixels[..., 3:].astype(np.float32)
+        mean = cv2.resize(np.concatenate([pixels[..., :3] * alpha, alpha], axis=2), size, interpolation=cv2.INTER_AREA)
+        mean[..., :3] /= np.maximum(mean[..., 3:], 1e-6)
+        pixels = np.rint(mean).astype(np.uint8)
+    else:
+        pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+    if mask is not None:
+        mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+    return View(resized(view.camera, *size), pixels, mask)
 
 
 def _band(view: View, rng: np.random.Generator) -> View:

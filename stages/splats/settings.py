@@ -48,5 +48,5 @@ class SplatsSettings:
 
 
 STAGE = Stage(
-    name="splats", version=13, settings=SplatsSettings, needs=("bake", "train", "poses"), run=ByName("stages.splats.run:run"), uses_device=True,
+    name="splats", version=14, settings=SplatsSettings, needs=("bake", "train", "poses"), run=ByName("stages.splats.run:run"), uses_device=True,
 )  # fmt: skip

@@ -10,7 +10,7 @@ from efficientnerf.asset.cascades import cascades_of
 from efficientnerf.asset.rendering import render as render_tree
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.backends.splat_layout import SplatState
-from efficientnerf.geometry.cameras import Camera
+from efficientnerf.geometry.cameras import Camera, project
 from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.rendering.harmonics import C0, basis_numpy
 from efficientnerf.splats import merging, refit
@@ -184,6 +184,30 @@ def test_large_pictures_are_taken_in_bands_that_show_what_the_whole_shows(monkey
         np.testing.assert_allclose(render(gaussians, band.camera).colour, whole.colour[begin : begin + 16], atol=0.02)
         met[begin : begin + 16] += 1
     assert met.min() > 0
+
+
+def test_half_of_a_picture_shows_what_the_whole_shows_and_transparent_pixels_lend_it_no_colour() -> None:
+    pixels = np.zeros((7, 8, 4), np.uint8)
+    pixels[..., 0], pixels[:, ::2, 3] = 200, 255
+    view = refit.View(Camera("view", 8, 7, "SIMPLE_PINHOLE", (9.0, 4.0, 3.5), np.eye(4)), pixels)
+    half = refit._half(replace(view, mask=np.arange(56).reshape(7, 8) > 8))
+    assert (half.pixels == (200, 0, 0, 128)).all()
+    assert half.mask is not None
+    assert half.mask.tolist() == [[False] * 4, [True] * 4, [True] * 4]
+    middle = np.array([[0.1, -0.05, 1.0]])
+    np.testing.assert_allclose(project(half.camera, middle)[0], project(view.camera, middle)[0] * [1 / 2, 3 / 7])
+    assert (refit._half(replace(view, pixels=pixels[..., :3])).pixels == (200, 0, 0)).all()
+
+
+def test_large_pictures_are_taken_at_half_their_size_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    views, taken = photographs(ball(16, 0), ring(3)), list[refit.View]()
+    begun, half = merging.merged(ball(16, 0), ring(3), 100, 0), refit._half
+    monkeypatch.setattr(refit, "_half", lambda view: taken.append(view) or half(view))
+    refitted(begun, views, 20)
+    assert not taken
+    monkeypatch.setattr(refit, "COARSE_PIXELS", 1)
+    refitted(begun, views, 20)
+    assert len(taken) == 6, "of 20 steps the first are done by 0 to 5/19"
 
 
 def test_gaussians_are_divided_by_error_and_faint_ones_go() -> None:
