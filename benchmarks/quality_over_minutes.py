@@ -35,7 +35,7 @@ FILE = "quality_over_minutes"
 PEERS = "peers.json"
 # The asset is what counts, not the network.
 EVALUATION = (
-    "evaluate.field_views=1", "evaluate.strips=off", "evaluate.captured_path_frames=off", "evaluate.field_background_rays=1", "mesh.texture=off",
+    "evaluate.field_views=1", "evaluate.strips=off", "evaluate.captured_path_frames=off", "mesh.texture=off",
     "splats.make=off",
 )  # fmt: skip
 LIBRARIES = ("torch", "numba", "numpy")

@@ -26,9 +26,6 @@ class EvaluateSettings:
         f" {MAX_FIELD_RAYS} pixels in all.",
         advanced=True,
     )
-    field_background_rays: PositiveInt = setting(
-        500_000, "Has no effect, because assets of unbounded scenes have their own surroundings; kept so that settings of earlier runs are read.", advanced=True
-    )
     strips: Literal["on", "off"] = setting(
         "on", "Whether to show photograph, network, asset and mesh side by side at full size, for the worst, the median and the best view."
     )
