@@ -24,6 +24,7 @@ from benchmarks.scenes.catalogue import Recipe, cameras, recipes
 from benchmarks.scenes.drawn import drawn
 from benchmarks.scenes.rendering import image, nearest
 from efficientnerf.geometry.cameras import Camera, opengl_from_pose, rays
+from stages.io.pictures import opened
 
 SPLITS = ("train", "val", "test")
 POINTS = 4000
@@ -87,8 +88,6 @@ def as_blender(source: Path, folder: Path) -> Path:
 
     Raises SystemExit for images without alpha and for cameras that this form cannot hold.
     """
-    import cv2
-
     if (source / "transforms_test.json").exists():
         return source
     document = json.loads((source / "transforms.json").read_text(encoding="utf-8"))
@@ -103,8 +102,9 @@ def as_blender(source: Path, folder: Path) -> Path:
         for name in document[f"{split}_filenames"]:
             (folder / name).parent.mkdir(exist_ok=True)
             shutil.copyfile(source / name, folder / name)
-            if cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED).shape[2] != 4:
-                raise SystemExit(f"{source / name}: no alpha; what is behind it cannot be made white")
+            with opened(folder / name) as image:
+                if "A" not in image.getbands():
+                    raise SystemExit(f"{source / name}: no alpha; what is behind it cannot be made white")
     return folder
 
 

@@ -1,4 +1,4 @@
-"""The derivative of structural dissimilarity, 1 - SSIM (Wang et al. 2004), of a window: one formula, which torch calls and numba and Triton compile."""
+"""The derivative of structural dissimilarity, 1 - SSIM (Wang et al. 2004), of a window: one formula, which torch calls and numba compiles."""
 
 
 def structure_change(x, y, of_x, of_y, squares, products, c1, c2, two):

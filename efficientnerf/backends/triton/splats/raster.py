@@ -15,7 +15,6 @@ import triton.language as tl
 
 from efficientnerf.backends import layout as agreed
 from efficientnerf.backends import splat_layout as layout
-from efficientnerf.backends.structure import structure_change
 from efficientnerf.backends.triton.launch import INTERPRETED
 from efficientnerf.backends.triton.splats.projection import ALPHA, CONIC_A, CONIC_B, CONIC_C, LEAST_ALPHA, RECORD, RED, TILE, X, Y
 from efficientnerf.backends.triton.vectors import Vec3
@@ -24,7 +23,6 @@ SUMS, ERROR = tl.constexpr(layout.SUMS), tl.constexpr(layout.ERROR)
 MOST_ALPHA, LEAST_TRANSMITTANCE = tl.constexpr(float(layout.MOST_ALPHA)), tl.constexpr(float(layout.LEAST_TRANSMITTANCE))
 C1, C2, SIDE, WINDOW = tl.constexpr(agreed.SSIM_C1), tl.constexpr(agreed.SSIM_C2), tl.constexpr(8), tl.constexpr(agreed.SSIM_WINDOW)
 CHUNK = tl.constexpr(16 if INTERPRETED else 4)
-_structure_change = triton.jit(structure_change)
 BLOCKS = (layout.TILE // SIDE.value) ** 2  # of a tile
 
 
@@ -156,11 +154,14 @@ def _window_mean(x):
 
 @triton.jit
 def _structure_slope(difference, y, whole, weight):
-    """Half of the derivative of structural dissimilarity by a channel of pixels whose window is `whole`."""
+    """Half of the derivative of structural dissimilarity by a channel of pixels whose window is `whole`: `efficientnerf.backends.structure`, which Triton's
+    interpreter cannot read there."""
     x = y + difference
     of_x, of_y = _window_mean(x), _window_mean(y)
     x, y = x - of_x, y - of_y
-    change = _structure_change(x, y, of_x, of_y, _window_mean(x * x + y * y), _window_mean(x * y), C1, C2, 2)
+    means, deviations = of_x * of_x + of_y * of_y + C1, _window_mean(x * x + y * y) + C2
+    same_mean, together = (2 * of_x * of_y + C1) / means, (2 * _window_mean(x * y) + C2) / deviations
+    change = (y - x * together) * (same_mean / deviations) + (of_y - of_x * same_mean) * (together / means)
     return tl.where(whole, -weight * change, 0.0)
 
 
