@@ -141,7 +141,8 @@ class _HashNetwork(torch.autograd.Function):
     def forward(
         ctx: Any, points: Tensor, table: Tensor, levels: HashLevels, offset: float, precision: torch.dtype, gradient: GradientBuffer, *weights: Tensor
     ) -> Tensor:
-        at, features = np.empty((3, len(points)), np.float32), np.empty((table.shape[1] * len(levels.sides), len(points)), np.float32)
+        # Of torch, which aligns them with cache lines.
+        at, features = torch.empty(3, len(points)).numpy(), torch.empty(table.shape[1] * len(levels.sides), len(points)).numpy()
         hash_grid.transpose_points(_array(points), at)
         hash_grid.encode(at, table.detach().numpy(), *levels, features)
         prepared = mlp.pack_weights([weight.detach().numpy() for weight in weights], bfloat16=precision == torch.bfloat16)
