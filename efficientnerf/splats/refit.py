@@ -10,13 +10,13 @@ import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from efficientnerf.backends.dispatch import splats_on
 from efficientnerf.backends.layout import SSIM_WINDOW
 from efficientnerf.backends.splat_layout import DRAWS, GRADIENTS, LANES, OPACITY, ROTATION, SCALE, TILE, Lens, Picture, Rates, SplatState
-from efficientnerf.geometry.cameras import Camera, resized, rows_of
+from efficientnerf.geometry.cameras import Camera, rows_of
+from efficientnerf.rendering.halving import halved
 from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
 from efficientnerf.splats.rendering import LOG_SCALES, gaussians_from, lens_of, values_of
 
@@ -97,7 +97,7 @@ def refitted(
         done = max(number / max(steps - 1, 1), used)
         whole = views[order.pop()]
         if done < COARSE_UNTIL and whole.camera.width * whole.camera.height >= COARSE_PIXELS:
-            whole = _half(whole)
+            whole = View(*halved(whole.camera, whole.pixels, whole.mask))
         view = _band(whole, np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 6, number])))
         corner = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 9, number])).integers(SSIM_WINDOW, size=2)
         lens, picture = _moved(lens_of(view.camera, whole.camera), _picture(view, background), *corner.tolist())
@@ -138,22 +138,6 @@ def _divided(state: SplatState, most: int, relocated: float = 0.0) -> tuple[np.n
     parts[here, SCALE + longest] += np.log(SPLIT_SHARE)
     rows[halves] = parts
     return rows, moments
-
-
-def _half(view: View) -> View:
-    """The view at half its size, each pixel the mean of four, by their alpha; it counts where all of them do."""
-    size = view.camera.width // 2, view.camera.height // 2
-    pixels, mask = view.pixels, view.mask
-    if pixels.shape[2] == 4:
-        alpha = pixels[..., 3:].astype(np.float32)
-        mean = cv2.resize(np.concatenate([pixels[..., :3] * alpha, alpha], axis=2), size, interpolation=cv2.INTER_AREA)
-        mean[..., :3] /= np.maximum(mean[..., 3:], 1e-6)
-        pixels = np.rint(mean).astype(np.uint8)
-    else:
-        pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
-    if mask is not None:
-        mask = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
-    return View(resized(view.camera, *size), pixels, mask)
 
 
 def _band(view: View, rng: np.random.Generator) -> View:

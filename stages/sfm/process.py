@@ -162,8 +162,15 @@ def _end_in_words(code: int, last_words: list[str]) -> str:
             f"poses: structure from motion was ended by SIGKILL, as a system that runs out of memory does.{output} Close other programs, or lower"
             " poses.feature_image_size or poses.max_features; what is done is kept."
         )
-    how = f"by {signal.Signals(-code).name}" if code < 0 else f"with code {code} and no result"
+    how = f"by {_name_of(-code)}" if code < 0 else f"with code {code} and no result"
     return (
         f"poses: structure from motion ended {how}.{output} Run again. Should it end so again, lower poses.max_features, take out photographs, or install"
         " another version of pycolmap."
     )
+
+
+def _name_of(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:  # real-time signals have no name
+        return f"signal {number}"

@@ -20,7 +20,7 @@ from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera, project
 from efficientnerf.surface.mesh import vertex_normals
 from efficientnerf.surface.smoothing import vertex_neighbours
-from efficientnerf.surface.texturing.photographs import Photograph, halved, shown_vertices
+from efficientnerf.surface.texturing.photographs import Photograph, shown_vertices
 
 # docs/experiments/surface.md
 PLACES = 6  # photographs that a vertex is compared in
@@ -58,7 +58,7 @@ def refined(vertices: np.ndarray, faces: np.ndarray, photographs: Iterable[Photo
     grades, greys = [], []
     for photo in photographs:
         while photo.usable.size > MAX_PIXELS:
-            photo = halved(photo)
+            photo = photo.halved()
         cameras.append(photo.camera)
         grades.append(shown_vertices(vertices, faces, normals, photo, tick))
         greys.append(_grey(photo.colours))

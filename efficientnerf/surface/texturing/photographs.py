@@ -15,7 +15,8 @@ import numpy as np
 
 from efficientnerf.backends.numba.mesh.photographs import blend, mark_edges, observe, sweep_down
 from efficientnerf.backends.pieces import pieces
-from efficientnerf.geometry.cameras import Camera, project, resized
+from efficientnerf.geometry.cameras import Camera, project
+from efficientnerf.rendering.halving import halved
 from efficientnerf.surface.mesh import Mesh, face_areas
 from efficientnerf.surface.rasteriser import MeshImage, mesh_image
 from efficientnerf.surface.texturing.asset import interpolated
@@ -54,6 +55,12 @@ class Photograph:
     colours: np.ndarray
     usable: np.ndarray
 
+    def halved(self) -> Photograph:
+        """At half its size; usable where all four pixels are."""
+        camera, colours, usable = halved(self.camera, self.colours, self.usable)
+        assert usable is not None
+        return Photograph(camera, colours, usable)
+
 
 def photograph(camera: Camera, image: np.ndarray, mask: np.ndarray | None = None) -> Photograph:
     """A photograph as in files: uint8 (H, W, 3), or (H, W, 4) with straight alpha; mask (H, W) bool, True: use."""
@@ -61,15 +68,6 @@ def photograph(camera: Camera, image: np.ndarray, mask: np.ndarray | None = None
     if image.shape[2] == 4:
         usable[image[..., 3] < FAINT] = False
     return Photograph(camera, np.ascontiguousarray(image[..., :3]), usable)
-
-
-def halved(photo: Photograph) -> Photograph:
-    """The photograph at half its size, each pixel the mean of four; usable where all are."""
-    height, width = photo.usable.shape[0] // 2 * 2, photo.usable.shape[1] // 2 * 2  # of odd sizes the last row or column is left out
-    colours = photo.colours[:height, :width].reshape(height // 2, 2, width // 2, 2, 3)
-    mean = ((colours.astype(np.uint16).sum((1, 3)) + 2) // 4).astype(np.uint8)
-    usable = np.asarray(photo.usable[:height, :width].reshape(height // 2, 2, width // 2, 2).all((1, 3)))
-    return Photograph(resized(replace(photo.camera, width=width, height=height), width // 2, height // 2), mean, usable)
 
 
 @dataclass(frozen=True)
@@ -261,7 +259,7 @@ class PhotographTexture:
         """Let all texels see a photograph."""
         done = 0
         while done < self.halvings and min(photo.usable.shape) >= 2 * SMALLEST_PHOTOGRAPH:
-            photo, done = halved(photo), done + 1
+            photo, done = photo.halved(), done + 1
         seen = _seen(self.vertices, self.faces, self.normals, photo, tick)
         sharpness = np.float32(np.clip(SHARP * found.sharpness / self.sharpness, 0.05, 1.0)) if self.sharpness > 0 else np.float32(1)
         gains = np.ascontiguousarray(found.gains, np.float32)

@@ -10,8 +10,9 @@ from efficientnerf.asset.cascades import cascades_of
 from efficientnerf.asset.rendering import render as render_tree
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.backends.splat_layout import SplatState
-from efficientnerf.geometry.cameras import Camera, project
+from efficientnerf.geometry.cameras import Camera
 from efficientnerf.geometry.ndc import Ndc
+from efficientnerf.rendering.halving import halved
 from efficientnerf.rendering.harmonics import C0, basis_numpy
 from efficientnerf.splats import merging, refit
 from efficientnerf.splats.build import Budget, gaussians_of_asset
@@ -186,23 +187,10 @@ def test_large_pictures_are_taken_in_bands_that_show_what_the_whole_shows(monkey
     assert met.min() > 0
 
 
-def test_half_of_a_picture_shows_what_the_whole_shows_and_transparent_pixels_lend_it_no_colour() -> None:
-    pixels = np.zeros((7, 8, 4), np.uint8)
-    pixels[..., 0], pixels[:, ::2, 3] = 200, 255
-    view = refit.View(Camera("view", 8, 7, "SIMPLE_PINHOLE", (9.0, 4.0, 3.5), np.eye(4)), pixels)
-    half = refit._half(replace(view, mask=np.arange(56).reshape(7, 8) > 8))
-    assert (half.pixels == (200, 0, 0, 128)).all()
-    assert half.mask is not None
-    assert half.mask.tolist() == [[False] * 4, [True] * 4, [True] * 4]
-    middle = np.array([[0.1, -0.05, 1.0]])
-    np.testing.assert_allclose(project(half.camera, middle)[0], project(view.camera, middle)[0] * [1 / 2, 3 / 7])
-    assert (refit._half(replace(view, pixels=pixels[..., :3])).pixels == (200, 0, 0)).all()
-
-
 def test_large_pictures_are_taken_at_half_their_size_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    views, taken = photographs(ball(16, 0), ring(3)), list[refit.View]()
-    begun, half = merging.merged(ball(16, 0), ring(3), 100, 0), refit._half
-    monkeypatch.setattr(refit, "_half", lambda view: taken.append(view) or half(view))
+    views, taken = photographs(ball(16, 0), ring(3)), list[Camera]()
+    begun = merging.merged(ball(16, 0), ring(3), 100, 0)
+    monkeypatch.setattr(refit, "halved", lambda camera, *rest: taken.append(camera) or halved(camera, *rest))
     refitted(begun, views, 20)
     assert not taken
     monkeypatch.setattr(refit, "COARSE_PIXELS", 1)
