@@ -242,7 +242,7 @@ def _judged(hit: Hit, child: Child, began: bool, last: str) -> list[str]:
         "INT INT": child.code in (130, -signal.SIGINT) or done,
         "STOP": child.code == -signal.SIGKILL or done,
     }[hit.signal]
-    wrong = [] if good else [f"it ended with {child.code} after {hit.signal}: {child.errors.strip()[-300:]}"]
+    wrong = [] if good and "hung:" not in child.errors else [f"it ended with {child.code} after {hit.signal}: {child.errors.strip()[-300:]}"]
     if hit.signal != "KILL" and "Traceback" in child.errors and not (default and (child.fresh or hit.signal == "INT INT")):
         wrong.append(f"a traceback: {child.errors.strip()[-300:]}")
     return wrong

@@ -6,6 +6,7 @@ command in a fresh process. Nothing here starts a thread: a fork of a process wi
 
 import contextlib
 import ctypes
+import faulthandler
 import gc
 import importlib
 import json
@@ -90,11 +91,24 @@ class Child:
             self.stage = ""
 
     def alive(self) -> bool:
+        """What takes longer than LIMIT is killed: exit code -9, and `hung` in its errors, behind what its threads were at."""
         if self.code is None:
             pid, status = os.waitpid(self.pid, os.WNOHANG)
-            if pid:
+            if not pid and time.monotonic() - self.began > LIMIT:
+                self._abort()
+            elif pid:
                 self.code = os.waitstatus_to_exitcode(status)
         return self.code is None
+
+    def _abort(self) -> None:
+        self.signal(signal.SIGCONT, group=True)
+        self.signal(signal.SIGABRT)  # `faulthandler` prints the stacks
+        time.sleep(1.0)
+        self.signal(signal.SIGKILL, group=True)
+        with open(self.errors_file, "a", encoding="utf-8") as file:
+            file.write(f"hung: not done after {LIMIT:g} s\n")
+        os.waitpid(self.pid, 0)
+        self.code = -signal.SIGKILL
 
     def signal(self, number: int, *, group: bool = False) -> None:
         if self.code is None:
@@ -102,15 +116,9 @@ class Child:
                 os.killpg(self.pid, number) if group else os.kill(self.pid, number)
 
     def end(self) -> int:
-        """Wait for the end; the exit code, negative for a signal. What takes longer than LIMIT is killed: exit code -9, and `hung` in its errors."""
+        """Wait for the end; the exit code, negative for a signal."""
         while self.alive():
             self.listen(0.02)
-            if time.monotonic() - self.began > LIMIT:
-                self.signal(signal.SIGKILL, group=True)
-                with open(self.errors_file, "a", encoding="utf-8") as file:
-                    file.write(f"hung: not done after {LIMIT:g} s\n")
-                os.waitpid(self.pid, 0)
-                self.code = -signal.SIGKILL
         while not self._closed and select.select([self.reading], [], [], 0)[0]:
             self.listen()
         os.close(self.reading)
@@ -207,6 +215,10 @@ def _run(arguments: Sequence[str], armed: Armed | None, workflow: Any) -> int:
     sys.argv = ["enerf", *arguments]
     # Whatever the parent made of its own: pytest, for one, puts others in their place.
     sys.stdout, sys.stderr = (open(descriptor, "w", encoding="utf-8", closefd=False) for descriptor in (1, 2))  # noqa: SIM115
+    faulthandler.enable(os.fdopen(os.dup(2), "w"))  # stages keep what libraries print on 2
+    # numba guards its threads by a semaphore, which forked processes share: one that is killed while it holds it would keep all others waiting for ever.
+    if "numba" in sys.modules:
+        importlib.import_module("numba.np.ufunc.parallel")._set_init_process_lock()
     from workflows.cli.main import main
 
     if armed is not None and python_alone():

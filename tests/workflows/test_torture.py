@@ -2,11 +2,16 @@
 
 import errno
 import json
+import multiprocessing
+import signal
+from dataclasses import replace
 from pathlib import Path
 
+import numba
 import pytest
+from numba.np.ufunc import parallel
 
-from benchmarks.torture import processes, trap
+from benchmarks.torture import preparation, processes, trap
 from benchmarks.torture.cases import NEW, Case, Cases
 from benchmarks.torture.comparison import Expected, digests, names
 from benchmarks.torture.kills import Prepared, Rounds
@@ -46,6 +51,27 @@ def test_killed_and_signalled_toy_runs_end_in_the_same_artifacts(toy: tuple[Prep
     assert [hit for hit in hits if hit["wrong"]] == []
     assert {hit["moment"] for hit in hits} == {"time", "call"}
     assert rounds.kills >= 4
+
+
+def test_a_hung_run_is_ended_and_shows_where_it_was(toy: tuple[Prepared, Workflow], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    prepared, workflow = toy
+    monkeypatch.setattr(processes, "LIMIT", 2.0)
+    child = processes.start(prepared.source.arguments(tmp_path / "run", "--set", "train.fail=slow"), tmp_path / "errors", workflow=workflow)
+    assert child.end() == -signal.SIGKILL
+    assert "hung: not done after 2 s" in child.errors
+    assert "in _wait_for" in child.errors
+
+
+def test_a_run_waits_for_no_lock_of_one_that_was_killed(toys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """numba's is a semaphore that forked processes share."""
+    numba.get_num_threads()
+    monkeypatch.setattr(processes, "LIMIT", 20.0)
+    monkeypatch.setattr(parallel, "_backend_init_process_lock", multiprocessing.get_context().RLock())
+    assert preparation.wait_for([processes.forked(lambda: parallel._backend_init_process_lock.acquire() and None)]) == 0  # ends with it
+    stage = replace(TOYS[0], run=lambda job: (job.out / "text.txt").write_text(f"{numba.get_num_threads()}\n", encoding="utf-8"))
+    source = Source("toy", toys, ("--preset", "tiny", "--device", "cpu"))
+    child = processes.start(source.arguments(tmp_path / "run"), tmp_path / "errors", workflow=Workflow((stage, *TOYS[1:]), toys.parent / "presets"))
+    assert child.end() == 0, child.errors
 
 
 FAULTS = (
