@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from PIL.ExifTags import IFD, Base
 
-from stages.io.pictures import UnreadableImage, exif_of, grey_of, opened, orientation_of, rgb_and_alpha
+from stages.io.pictures import LOSSY, UnreadableImage, exif_of, grey_of, opened, orientation_of, rgb_and_alpha
 
 FULL_FRAME_DIAGONAL = float(np.hypot(36.0, 24.0))  # mm; the "35 mm equivalent" focal length refers to it
 
@@ -80,12 +80,25 @@ def read_photo(path: Path, max_side: int) -> DecodedPhoto:
 
 def read_mask_file(path: Path, photo: PhotoDetails) -> np.ndarray:
     """(h, w) bool at the photograph's working size, True where the mask is not black; raises UnreadableImage."""
+    levels, lossy = read_levels(path, photo.orientation, photo.width, photo.height)
+    if not same_aspect(levels.shape, (photo.height, photo.width)):
+        raise UnreadableImage(f"{path.name} is {levels.shape[1]}x{levels.shape[0]}, the photograph {photo.width}x{photo.height}")
+    return marked_at(levels, lossy, (photo.work_width, photo.work_height))
+
+
+def read_levels(path: Path, orientation: int, width: int, height: int) -> tuple[np.ndarray, bool]:
+    """A mask file of an image as that is meant to be seen, (H, W) uint8, and whether its format keeps levels only about as they were; raises UnreadableImage.
+
+    orientation, width, height  of the image, see `upright_mask`
+    """
     with opened(path) as image:
-        mask = apply_exif_orientation(grey_of(image), orientation_of(image))
-    mask = upright_mask(mask, photo.orientation, photo.width, photo.height)
-    if not same_aspect(mask.shape, (photo.height, photo.width)):
-        raise UnreadableImage(f"{path.name} is {mask.shape[1]}x{mask.shape[0]}, the photograph {photo.width}x{photo.height}")
-    return mask_at(mask, (photo.work_width, photo.work_height)) > 0
+        lossy, levels = image.format in LOSSY, apply_exif_orientation(grey_of(image), orientation_of(image))
+    return upright_mask(levels, orientation, width, height), lossy
+
+
+def marked_at(levels: np.ndarray, lossy: bool, size: tuple[int, int]) -> np.ndarray:
+    """Where a mask is not black, (h, w) bool at a working size (width, height); what a lossy format makes of black is up to 127."""
+    return mask_at(levels, size) > (127 if lossy else 0)
 
 
 def mask_at(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -220,17 +220,13 @@ def rgb_and_alpha(image: Any, as_stored: bool = False) -> tuple[np.ndarray, np.n
 
 
 def grey_of(image: Any) -> np.ndarray:
-    """(H, W) uint8 of an opened image for masks: its alpha channel where that leaves anything out, as Brush has it, else luminance. 0 is black; of 16 bits
-    whatever is not 0 is 255."""
-    _refuse_unknown_samples(image)
-    image.load()  # here, and not within NumPy, which takes some errors for another kind of object
-    if image.mode in _ALPHA_MODES:
-        alpha = rgb_and_alpha(image)[1]
-        if alpha is not None and (alpha < 255).any():
-            return alpha
-    if image.mode.startswith("I"):
-        return np.where(np.asarray(image) > 0, np.uint8(255), np.uint8(0))
-    return np.asarray(image.convert("L"))
+    """(H, W) uint8 of an opened image for masks: its alpha channel where that leaves anything out, as Brush has it, else the largest of its channels as they
+    are stored, whose levels are no colours. Black alone is 0: of 16 bits the least other level is 1."""
+    rgb, alpha = rgb_and_alpha(image, as_stored=True)
+    if alpha is not None and (alpha < 255).any():
+        return alpha
+    levels = rgb.max(axis=2)
+    return np.maximum(levels, np.asarray(image) > 0) if image.mode.startswith("I") else levels
 
 
 def integers_of(image: Any) -> np.ndarray:

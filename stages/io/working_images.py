@@ -15,8 +15,8 @@ from pipeline.text import printable
 from stages.artifacts import PosesOutputs
 from stages.io.capture import Photo, Silhouettes
 from stages.io.matting import without_background
-from stages.io.photo import apply_exif_orientation, mask_at, resized, same_aspect, upright_mask, working_size
-from stages.io.pictures import LOSSY, UnreadableImage, holds_eight_bits, opened, orientation_of, profile_of, rgb_and_alpha
+from stages.io.photo import apply_exif_orientation, marked_at, read_levels, resized, same_aspect, working_size
+from stages.io.pictures import UnreadableImage, holds_eight_bits, opened, orientation_of, profile_of, rgb_and_alpha
 from stages.io.png import FAST, write_png
 
 MAX_PART = 200  # bytes of a part of the path of a working image
@@ -33,7 +33,6 @@ class Decoded:
     pixels: np.ndarray  # (H, W, 3 or 4) uint8 sRGB, straight alpha
     verbatim: bool  # whether the file itself holds exactly these pixels in a form that later stages read
     orientation: int  # EXIF's number, 1-8
-    lossy: bool  # whether the format keeps pixels only about as they were
     fault: str | None = None  # why the file's colour profile is not used, if it has one and it is not
 
 
@@ -53,10 +52,9 @@ def decode(path: Path, as_stored: bool = False) -> Decoded:
     with opened(path) as image:
         orientation, profile = orientation_of(image), profile_of(image)
         verbatim = orientation == 1 and "transparency" not in image.info and _is_plain(image) and profile.transform is None
-        lossy = image.format in LOSSY
         rgb, alpha = rgb_and_alpha(image, as_stored)
     pixels = rgb if alpha is None else np.dstack([rgb, alpha])
-    return Decoded(np.ascontiguousarray(apply_exif_orientation(pixels, orientation)), verbatim, orientation, lossy, profile.fault)
+    return Decoded(np.ascontiguousarray(apply_exif_orientation(pixels, orientation)), verbatim, orientation, profile.fault)
 
 
 def write(photo: Photo, folder: Path, relative: str, *, max_side: int, silhouettes: Silhouettes = NO_SILHOUETTES, may_be_empty: bool = True) -> Written:
@@ -183,24 +181,21 @@ def mask_levels(photo: Photo, orientation: int) -> tuple[np.ndarray, list[str]]:
 
 def _usable(photo: Photo, size: tuple[int, int], orientation: int) -> tuple[np.ndarray, list[str]]:
     """(h, w) bool at working size from the photo's mask file, and warnings."""
-    mask, lossy, warnings = _read_mask(photo, orientation)
-    marked = mask_at(mask, size) > (127 if lossy else 0)  # lossy files have no clean zero
+    levels, lossy, warnings = _read_mask(photo, orientation)
+    marked = marked_at(levels, lossy, size)
     return marked if photo.mask_ignore == "black" else ~marked, warnings
 
 
 def _read_mask(photo: Photo, orientation: int) -> tuple[np.ndarray, bool, list[str]]:
-    """The photo's mask file as it is meant to be seen, (H, W) uint8, whether its format is lossy, and warnings. Raises UnreadableImage, BadInput."""
+    """The photo's mask file as `read_levels` has it, and warnings. Raises UnreadableImage, BadInput."""
     assert photo.mask is not None
+    expected = photo.camera.width, photo.camera.height
     try:
-        decoded = decode(photo.mask, as_stored=True)
+        levels, lossy = read_levels(photo.mask, orientation, *expected)
     except UnreadableImage as error:
         raise UnreadableImage(f"its mask {printable(photo.mask.name)} is {error}") from error
-    expected = photo.camera.width, photo.camera.height
-    alpha = decoded.pixels[..., 3] if decoded.pixels.shape[-1] == 4 else None
-    by_alpha = alpha is not None and (alpha < 255).any()  # as Brush has it; else any colour counts as not black
-    mask = upright_mask(decoded.pixels[..., 3 if by_alpha else slice(0, 3)].reshape(*decoded.pixels.shape[:2], -1).max(-1), orientation, *expected)
-    found = mask.shape[1], mask.shape[0]
+    found = levels.shape[1], levels.shape[0]
     sizes = f"the mask is {found[0]}x{found[1]}, its image {expected[0]}x{expected[1]}"
     if not same_aspect(found, expected):
         raise BadInput(f"{printable(photo.mask)}: {sizes}, of another aspect. Make the mask for this image.")
-    return mask, decoded.lossy, [] if found == expected else [f"{printable(photo.mask.name)}: {sizes}; it was resized."]
+    return levels, lossy, [] if found == expected else [f"{printable(photo.mask.name)}: {sizes}; it was resized."]

@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from efficientnerf.geometry.cameras import Camera
 from stages.io import photo as reading
+from stages.io import working_images
+from stages.io.capture import Photo
 from stages.sfm.images import prepare_images
 
 
@@ -42,10 +45,6 @@ def test_what_is_transparent_may_count(masks: dict[str, Path | None], masked: bo
 @pytest.mark.parametrize("tagged", [False, True])
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
 def test_masks_are_turned_alike_for_features_and_for_working_images(tmp_path: Path, orientation: int, tagged: bool, size: tuple[int, int]) -> None:
-    from efficientnerf.geometry.cameras import Camera
-    from stages.io import working_images
-    from stages.io.capture import Photo
-
     exif = Image.Exif()
     exif[274] = orientation
     Image.new("RGB", size).save(tmp_path / "a.png", exif=exif)
@@ -59,3 +58,25 @@ def test_masks_are_turned_alike_for_features_and_for_working_images(tmp_path: Pa
     assert written.mask is not None
     with Image.open(tmp_path / "out" / written.mask) as mask:
         np.testing.assert_array_equal(np.asarray(mask) > 0, for_features)
+
+
+@pytest.mark.parametrize("kind", ["16-bit labels", "blue labels", "lossy"])
+def test_masks_mark_the_same_pixels_for_features_and_for_working_images(tmp_path: Path, kind: str) -> None:
+    marked = np.zeros((30, 40), bool)
+    marked[8:24, 8:32] = True
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
+    file = tmp_path / ("m.jpg" if kind == "lossy" else "m.png")
+    match kind:
+        case "16-bit labels":
+            Image.fromarray(marked.astype(np.uint16) * 3).save(file)
+        case "blue labels":
+            Image.fromarray(marked[..., None] * np.array([0, 0, 2], np.uint8)).save(file)
+        case "lossy":  # noise where it is black
+            Image.fromarray(np.where(marked, 250, 9).astype(np.uint8)).save(file, quality=40)
+    photo = reading.read_photo(tmp_path / "a.png", 100)
+    np.testing.assert_array_equal(reading.read_mask_file(file, photo), marked)
+    camera = Camera("a.png", photo.width, photo.height, "SIMPLE_PINHOLE", (40.0, 20.0, 20.0), np.eye(4))
+    written = working_images.write(Photo(camera, tmp_path / "a.png", file), tmp_path / "out", "a.png", max_side=100)
+    assert written.mask is not None
+    with Image.open(tmp_path / "out" / written.mask) as mask:
+        np.testing.assert_array_equal(np.asarray(mask) > 0, marked)
