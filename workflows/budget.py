@@ -17,7 +17,9 @@ FEW_PIXELS_TRAIN_SHARE = 0.6  # of scenes with surroundings and few pixels, whic
 FEW_PIXELS = 16e6  # of all photographs at working size
 WITHOUT_SURROUNDINGS = ("blender", "llff")  # formats of objects before a constant background, and of forward-facing captures
 MIN_TRAIN, MIN_BAKE = 15.0, 20.0  # seconds, of a budget that is large enough for both
-SPLATS_SHARE, MAX_SPLATS = 0.15, 600.0  # of the budget, and seconds, in which two cores take all steps of any capture; docs/experiments/splats.md
+# Of the budget, for Gaussians: the first share up to so many seconds, the second from so many on, and between them in proportion; and seconds, in which two
+# cores take all steps of any capture. docs/experiments/splats.md
+SPLATS_SHARES, SPLATS_SECONDS, MAX_SPLATS = (0.15, 0.35), (120.0, 600.0), 600.0
 
 
 def share_budget(seconds: float, share: float, *, splats: bool) -> dict[str, float]:
@@ -26,13 +28,18 @@ def share_budget(seconds: float, share: float, *, splats: bool) -> dict[str, flo
     share   of what train and bake have together, for train: see `train_share`
     splats  whether the run makes Gaussians
     """
-    parts = {"splats": min(SPLATS_SHARE * seconds, MAX_SPLATS)} if splats else {}
+    parts = {"splats": min(_splats_share(seconds) * seconds, MAX_SPLATS)} if splats else {}
     seconds -= sum(parts.values())
     if seconds <= MIN_TRAIN + MIN_BAKE:
         train = seconds * MIN_TRAIN / (MIN_TRAIN + MIN_BAKE)
     else:
         train = min(max(share * seconds, MIN_TRAIN), seconds - MIN_BAKE)
     return {"train": train, "bake": seconds - train, **parts}
+
+
+def _splats_share(seconds: float) -> float:
+    (least, most), (first, last) = SPLATS_SHARES, SPLATS_SECONDS
+    return least + (most - least) * min(max((seconds - first) / (last - first), 0.0), 1.0)
 
 
 def train_share(sources: Sequence[Path], poses: Any) -> float:

@@ -79,14 +79,15 @@ def refitted(
     used = began = 0.0 if time_used is None else time_used()
     times, relocated = _divisions(steps)
     order: list[int] = []
-    harmonics, fade = harmonics_rate(views), min(FADE / max(steps, 1), MOST_FADE)
+    harmonics, fade = harmonics_rate(views), _fade(steps)
     for number in range(steps):
         if time_used is not None:
             used = time_used()
             if used >= 1:
                 break
             if number == TIMED:
-                times, relocated = _divisions(min(steps, int(TIMED * (1 - began) / max(used - began, 1e-9))))
+                expected = min(steps, int(TIMED * (1 - began) / max(used - began, 1e-9)))
+                (times, relocated), fade = _divisions(expected), _fade(expected)
                 times = tuple(share for share in times if share > max(used, number / steps))
         if not order:
             order = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 5, number])).permutation(len(views)).tolist()
@@ -106,6 +107,10 @@ def refitted(
             reached(number + 1)
     fitted = gaussians_from(fit.state().rows)
     return fitted.subset(fitted.opacities >= LEAST_OPACITY)
+
+
+def _fade(steps: int) -> float:
+    return min(FADE / max(steps, 1), MOST_FADE)
 
 
 def _divisions(steps: int) -> tuple[tuple[float, ...], float]:

@@ -29,7 +29,7 @@ class SplatsSettings:
     iterations: Count | Auto = setting(
         "auto",
         "Number of training steps, each on an image or on rows of a large one; 0: none; auto: sixteen passes over all pixels and 30"
-        " steps an image at least, 1080 to 3600; with time_budget up to 8000, if they fit.",
+        " steps an image at least, 1080 to 3600; with time_budget up to three times as many, at most 8000, if they fit.",
         advanced=True,
     )
     time_budget: Seconds | Off = setting(
@@ -48,5 +48,5 @@ class SplatsSettings:
 
 
 STAGE = Stage(
-    name="splats", version=14, settings=SplatsSettings, needs=("bake", "train", "poses"), run=ByName("stages.splats.run:run"), uses_device=True,
+    name="splats", version=15, settings=SplatsSettings, needs=("bake", "train", "poses"), run=ByName("stages.splats.run:run"), uses_device=True,
 )  # fmt: skip

@@ -35,6 +35,8 @@ def test_the_parts_make_up_the_budget(share: float, splats: bool) -> None:
         if both >= MIN_TRAIN + MIN_BAKE:
             assert parts["train"] >= MIN_TRAIN - 1e-9
             assert parts["bake"] >= MIN_BAKE - 1e-9
+        if splats:
+            assert parts["splats"] == pytest.approx({1e5: 600.0}.get(seconds, seconds * {240.0: 0.2, 600.0: 0.35}.get(seconds, 0.15)))
         if seconds >= 240:
             assert parts["train"] == pytest.approx(share * both)
         former = parts
