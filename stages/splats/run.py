@@ -39,7 +39,7 @@ from stages.splats.pictures import photographs, render_cameras, renders
 from stages.splats.settings import SplatsSettings
 
 PASSES, STEPS_A_VIEW, FEWEST_STEPS, MOST_STEPS = 16, 30, 1080, 3600  # docs/experiments/splats.md
-TIMED, MOST_TIMED_STEPS = 3, 8000  # where a time budget may end them earlier: as many times these, at most
+MORE_WITH_TIME, MOST_TIMED_STEPS = 3, 8000  # with a time budget, which may end them earlier: so many times as many, at most
 PREVIEW = (480, 360)  # pixels, of each of the two pictures
 
 
@@ -69,7 +69,7 @@ def budget_of(settings: SplatsSettings, pixels: Sequence[int]) -> Budget:
     steps = resolved(settings.iterations)
     if steps is None:
         usual = max(math.ceil(PASSES * sum(pixels) / PIXELS), STEPS_A_VIEW * len(pixels), FEWEST_STEPS)
-        steps = min(usual, MOST_STEPS) if settings.time_budget == "off" else min(TIMED * usual, MOST_TIMED_STEPS)
+        steps = min(usual, MOST_STEPS) if settings.time_budget == "off" else min(MORE_WITH_TIME * usual, MOST_TIMED_STEPS)
     return Budget(most_gaussians(settings, pixels), settings.sh_degree, steps, settings.seed)
 
 
