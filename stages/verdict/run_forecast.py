@@ -55,11 +55,9 @@ def seconds_of(settings: Mapping[str, Any], *, views: int, megapixels: float, wh
     }
     scale = (SERIAL_SHARE + (1 - SERIAL_SHARE) / threads) * slower / SLOWER
     found = {stage: scale * seconds for stage, seconds in processor.items()}
-    for stage in ("train", "bake"):
+    for stage in ("train", "bake", "splats"):
         budget = resolved(settings[stage].time_budget)
-        found[stage] = found[stage] if budget is None else budget
-    if (budget := resolved(settings["splats"].time_budget)) is not None:
-        found["splats"] = min(found["splats"], budget)
+        found[stage] = budget if budget is not None and found[stage] else found[stage]
     return {stage: round(seconds, 1) for stage, seconds in found.items()}
 
 
