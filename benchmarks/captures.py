@@ -124,7 +124,8 @@ def write_picture(run: Path, path: Path) -> bool:
     from stages.figures.plots import LABEL_HEIGHT, MARGIN
     from stages.io.pictures import opened
 
-    strips = [strip for which in ("median", "worst", "best") if (strip := EvaluateOutputs.of_run(run).strip(which)).exists()]
+    made = EvaluateOutputs.of_run(run)
+    strips = [strip for strip in (made.strip_median, made.strip_worst, made.strip_best) if strip.exists()]
     if not strips:
         return False
     with opened(strips[0], ("PNG",)) as picture:

@@ -19,7 +19,7 @@ WITHOUT_SURROUNDINGS = ("blender", "llff")  # formats of objects before a consta
 MIN_TRAIN, MIN_BAKE = 15.0, 20.0  # seconds, of a budget that is large enough for both
 # Of the budget, for Gaussians: the first share up to so many seconds, the second from so many on, and between them in proportion; and seconds, in which two
 # cores take all steps of any capture. docs/experiments/splats.md
-SPLATS_SHARES, SPLATS_SECONDS, MAX_SPLATS = (0.15, 0.35), (120.0, 600.0), 600.0
+SPLATS_SHARES, SPLATS_SECONDS, MAX_SPLATS = (0.15, 0.25), (120.0, 600.0), 600.0
 
 
 def share_budget(seconds: float, share: float, *, splats: bool) -> dict[str, float]:

@@ -36,7 +36,7 @@ def test_the_parts_make_up_the_budget(share: float, splats: bool) -> None:
             assert parts["train"] >= MIN_TRAIN - 1e-9
             assert parts["bake"] >= MIN_BAKE - 1e-9
         if splats:
-            assert parts["splats"] == pytest.approx({1e5: 600.0}.get(seconds, seconds * {240.0: 0.2, 600.0: 0.35}.get(seconds, 0.15)))
+            assert parts["splats"] == pytest.approx({1e5: 600.0}.get(seconds, seconds * {240.0: 0.175, 600.0: 0.25}.get(seconds, 0.15)))
         if seconds >= 240:
             assert parts["train"] == pytest.approx(share * both)
         former = parts
