@@ -227,6 +227,6 @@ def training_rates(device: str, steps: int, side: int, views: int, **settings: A
     timed = steps - steps // 2 - 1
     assert done is not None
     return {
-        "steps_per_second": round(timed / took, 1), "samples_per_second": round(samples / took), "psnr": round(done.psnr, 2), "rays": done.rays,
-        "waits_in_32_steps": waits, "rays_left_out_in_32_steps": left_out,
+        "steps_per_second": round(timed / took, 1), "samples_per_second": round(samples / took),
+        "psnr": round(-10 * math.log10(max(done.loss, 1e-10)), 2), "rays": done.rays, "waits_in_32_steps": waits, "rays_left_out_in_32_steps": left_out,
     }  # fmt: skip
