@@ -92,8 +92,8 @@ def read_levels(path: Path, orientation: int, width: int, height: int) -> tuple[
     orientation, width, height  of the image, see `upright_mask`
     """
     with opened(path) as image:
-        lossy, levels = image.format in LOSSY, apply_exif_orientation(grey_of(image), orientation_of(image))
-    return upright_mask(levels, orientation, width, height), lossy
+        own, lossy, levels = orientation_of(image), image.format in LOSSY, grey_of(image)
+    return upright_mask(apply_exif_orientation(levels, own), orientation, width, height), lossy
 
 
 def marked_at(levels: np.ndarray, lossy: bool, size: tuple[int, int]) -> np.ndarray:
