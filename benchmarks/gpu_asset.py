@@ -5,12 +5,11 @@ Sizes are arguments, so that the code runs without a device too.
 
 from __future__ import annotations
 
-import math
 import time
 from typing import Any
 
 import numpy as np
-from gpu_kernels import BOUNDS, ball, counted_waits, orbit, synchronise
+from gpu_kernels import BOUNDS, ball, counted_waits, decibels, orbit, synchronise
 
 from efficientnerf.asset import bake
 from efficientnerf.asset.refinement import fit
@@ -107,7 +106,3 @@ def test_view_psnr(m: Model, trees: list[NerfTree], camera: Camera, device: str)
     for name, tree in zip(("baked", "refined"), trees, strict=True):
         renders[name] = render(tree.to(device), camera, background=WHITE).colour
     return {name: decibels(float(((colour - truth) ** 2).mean())) for name, colour in renders.items()}
-
-
-def decibels(error: float) -> float:
-    return round(-10 * math.log10(max(error, 1e-10)), 2)

@@ -205,6 +205,10 @@ def ball(cameras: list[Camera]) -> Pixels:
     return Pixels(cameras, images, [None] * count, np.full(count, 1.5), np.full(count, 4.5))
 
 
+def decibels(error: float) -> float:
+    return round(-10 * math.log10(max(error, 1e-10)), 2)
+
+
 def training_rates(device: str, steps: int, side: int, views: int, **settings: Any) -> dict[str, Any]:
     """Steps and samples a second on the ball, the second half of the steps timed; and which lines waited for the device in 32 further steps."""
     from efficientnerf.training.loop import train, trainer
@@ -228,5 +232,5 @@ def training_rates(device: str, steps: int, side: int, views: int, **settings: A
     assert done is not None
     return {
         "steps_per_second": round(timed / took, 1), "samples_per_second": round(samples / took),
-        "psnr": round(-10 * math.log10(max(done.loss, 1e-10)), 2), "rays": done.rays, "waits_in_32_steps": waits, "rays_left_out_in_32_steps": left_out,
+        "psnr": decibels(done.loss), "rays": done.rays, "waits_in_32_steps": waits, "rays_left_out_in_32_steps": left_out,
     }  # fmt: skip
