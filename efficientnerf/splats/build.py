@@ -5,12 +5,16 @@ from dataclasses import dataclass
 
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.splats.gaussians import Gaussians
-from efficientnerf.splats.merging import merged
+from efficientnerf.splats.merging import SHELL_DISTANCE, environment_shell, joined, merged
 from efficientnerf.splats.refit import View, refitted
 
 __all__ = ["Budget", "NothingToShow", "View", "gaussians_of_asset"]
 
-START = 0.8  # share of the Gaussians allowed that voxels are merged into: the rest is added where the error is; docs/experiments/splats.md
+# docs/experiments/splats.md
+START = 0.8  # share of the Gaussians allowed that voxels are merged into: the rest is added where the error is
+# Gaussians of the environment behind all that are fitted, which leave gaps where training pictures end: share of those allowed, and at most; and their
+# distance over that of the others.
+BEHIND_SHARE, BEHIND_MOST, BEHIND = 0.01, 1000, 1.3
 
 Progress = Callable[[int, int, str], None]
 
@@ -51,15 +55,16 @@ def gaussians_of_asset(
         report(max(step, int(budget.steps * passed)) + 1, "fitting Gaussians")
 
     report(0, "merging voxels")
-    begun = max(1, int(START * budget.count)) if budget.steps else budget.count
-    gaussians = merged(tree, [view.camera for view in views], begun, budget.degree)
+    behind = environment_shell(tree, min(int(BEHIND_SHARE * budget.count), BEHIND_MOST) if budget.steps else 0, 0, BEHIND * SHELL_DISTANCE)
+    most = budget.count - len(behind)
+    gaussians = merged(tree, [view.camera for view in views], max(1, int(START * most)) if budget.steps else most, budget.degree)
     if not len(gaussians):
         raise NothingToShow("no voxel of the asset shows in any picture: there is nothing that Gaussians could show")
     report(1, "fitting Gaussians")
     fitted = refitted(
-        gaussians, views, budget.steps, most=budget.count, background=tree.background, seed=budget.seed,
+        gaussians, views, budget.steps, most=most, background=tree.background, seed=budget.seed,
         reached=reached, time_used=time_used, device=tree.device,
     )  # fmt: skip
     if not len(fitted):
         raise NothingToShow("no Gaussian is left that shows in any picture")
-    return fitted
+    return joined(fitted, behind)

@@ -161,7 +161,7 @@ def cells_of(shown: Shown, colours: np.ndarray, most: int) -> np.ndarray:
 
 def merged(tree: NerfTree, cameras: Sequence[Camera], most: int, degree: int) -> Gaussians:
     """At most `most` Gaussians for the voxels that cameras see; none where they see nothing."""
-    shell = environment_shell(tree, most, degree)
+    shell = environment_shell(tree, min(int(SHELL_SHARE * most), SHELL_MOST), degree)
     shown = shown_voxels(tree, cameras)
     if not len(shown.voxels):
         return shell
@@ -253,11 +253,12 @@ def _directions(count: int) -> np.ndarray:
     return np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=-1)
 
 
-def environment_shell(tree: NerfTree, most: int, degree: int) -> Gaussians:
-    """Far Gaussians in the colours of a tree's environment map; none without one."""
-    count = 0 if tree.environment is None else min(int(SHELL_SHARE * most), SHELL_MOST)
+def environment_shell(tree: NerfTree, count: int, degree: int, distance: float = SHELL_DISTANCE) -> Gaussians:
+    """So many far Gaussians in the colours of a tree's environment map, in half diagonals of its outermost cascade; none without one."""
+    if tree.environment is None:
+        count = 0
     bounds = cascades_of(tree)[-1].bounds(tree.brick)
-    distance = SHELL_DISTANCE * np.linalg.norm(bounds[1] - bounds[0]) / 2
+    distance *= float(np.linalg.norm(bounds[1] - bounds[0])) / 2
     directions = _directions(count) if count else np.zeros((0, 3))
     axes = np.stack([*across(directions), directions], axis=-1)
     spacing = distance * np.sqrt(4 * np.pi / max(count, 1))

@@ -12,10 +12,11 @@ from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.backends.splat_layout import SplatState
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.geometry.ndc import Ndc
+from efficientnerf.rendering import environment
 from efficientnerf.rendering.halving import halved
 from efficientnerf.rendering.harmonics import C0, basis_numpy
-from efficientnerf.splats import merging, refit
-from efficientnerf.splats.build import Budget, gaussians_of_asset
+from efficientnerf.splats import build, merging, refit
+from efficientnerf.splats.build import Budget, View, gaussians_of_asset
 from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
 from efficientnerf.splats.refit import refitted
 from efficientnerf.splats.rendering import gaussians_from, lens_of, render, values_of
@@ -129,6 +130,20 @@ def test_whole_scenes_have_their_cascades_and_a_shell_of_their_environment() -> 
     assert away.sum() == 75
     outward = Camera("out", 16, 16, "SIMPLE_PINHOLE", (20.0, 8.0, 8.0), cameras[0].world_from_camera @ np.diag([-1.0, 1, -1, 1]))
     assert render(gaussians, outward).opacity.min() > 0.9
+
+
+def test_gaps_that_fitting_leaves_in_the_environment_are_filled_from_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    tree, cameras = random_cascades(count=2, degree=0), ring(3)
+    views = [View(camera, np.full((camera.height, camera.width, 3), 128, np.uint8)) for camera in cameras]
+    monkeypatch.setattr(build, "refitted", lambda gaussians, *_args, **_options: gaussians.subset(np.arange(len(gaussians)) < 10))
+    fitted = gaussians_of_asset(tree, views, Budget(count=30_000, degree=1, steps=1))
+    outward = Camera("out", 64, 64, "SIMPLE_PINHOLE", (32.0, 32.0, 32.0), cameras[0].world_from_camera @ np.diag([-1.0, 1, -1, 1]))
+    seen = render(fitted, outward)
+    assert len(fitted) == 10 + 300
+    assert seen.opacity.min() > 0.9
+    assert tree.environment is not None
+    wanted = environment.lookup(tree.environment, outward.world_from_camera[None, :3, 2])
+    np.testing.assert_allclose(seen.colour[30:34, 30:34].mean(axis=(0, 1)), wanted[0], atol=0.1)
 
 
 def test_the_same_pictures_give_the_same_bytes_and_what_cannot_be_seen_stays() -> None:
