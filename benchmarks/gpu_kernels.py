@@ -174,14 +174,15 @@ def splat_rates(device: str, count: int, side: int, repeats: int) -> dict[str, f
     from efficientnerf.backends.numba.splats.fit import SplatFit as HostFit
     from efficientnerf.backends.splat_layout import GRADIENTS, Picture
     from efficientnerf.backends.triton.splats.fit import SplatFit, splat_image
-    from efficientnerf.splats.refit import STRUCTURE, rates_of
+    from efficientnerf.splats.refit import HUBER_DELTA, STRUCTURE, rates_of
     from efficientnerf.splats.rendering import lens_of
 
     rng = np.random.default_rng(0)
     rows = rng.normal(0, 0.2, (count, 11 + 27)).astype(np.float32)
     rows[:, :3] *= 0.7 / np.linalg.norm(rows[:, :3], axis=1, keepdims=True)
     rows[:, 3:6] += np.log(1.5 / count**0.5)
-    picture = Picture(rng.integers(0, 256, (side, side, 4), np.uint8), np.ones((side, side), np.uint8), True, np.zeros(3, np.float32), np.float32(STRUCTURE))
+    pixels, limits = rng.integers(0, 256, (side, side, 4), np.uint8), map(np.float32, (STRUCTURE, HUBER_DELTA))
+    picture = Picture(pixels, np.ones((side, side), np.uint8), True, np.zeros(3, np.float32), *limits)
     lens, moments = lens_of(orbit(side, 1)[0]), np.zeros((count, GRADIENTS + rows.shape[1]), np.float32)
     fits = SplatFit(rows, moments, 2, device), HostFit(rows, moments, 2)
     took = {"image": milliseconds(lambda: splat_image(rows, 2, lens, device), device, repeats)}

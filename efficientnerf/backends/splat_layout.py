@@ -46,6 +46,8 @@ class Picture(NamedTuple):
     # weight of 1 - SSIM in the error of a pixel's channel, over grey or `background`; of windows of SSIM_WINDOW x SSIM_WINDOW pixels that all count, next to
     # each other from the corner on (`efficientnerf.backends.layout`)
     structure: np.float32
+    # Of a pixel whose channels have the squared error e, delta^2 (sqrt(1 + e / delta^2) - 1) is minimised, the pseudo-Huber loss; infinite: half of e
+    huber_delta: np.float32
 
 
 class Rates(NamedTuple):

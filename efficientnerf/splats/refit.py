@@ -1,9 +1,10 @@
 """Gaussians fitted to pictures: Adam on means, scales, rotations, opacities and harmonics.
 
 A step takes a picture, or rows of a large one with about PIXELS; the first steps take large pictures at half their size. It minimises the
-squared error, for a picture with alpha over all backgrounds at once, and 1 - SSIM of windows of 4 x 4 pixels, which begin at another corner in
-each step. Noise on the means and opacities that fade, after 3DGS-MCMC, keep few photographs from being overfitted. The order of the pictures,
-the rows, the corner and the noise are drawn by (seed, step). On the CPU the same pictures give the same bytes, on any number of threads.
+pseudo-Huber loss of each pixel's squared error, for a picture with alpha over all backgrounds at once, and 1 - SSIM of windows of 4 x 4 pixels,
+which begin at another corner in each step. Noise on the means and opacities that fade, after 3DGS-MCMC, keep few photographs from being
+overfitted. The order of the pictures, the rows, the corner and the noise are drawn by (seed, step). On the CPU the same pictures give the same
+bytes, on any number of threads.
 """
 
 import functools
@@ -24,7 +25,7 @@ from efficientnerf.splats.rendering import LOG_SCALES, gaussians_from, lens_of, 
 MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, HARMONICS = 0.1, 0.06, 0.02, 0.05, 0.02, 0.004  # learning rates of `fitting.Rates`
 # Of photographs that of the harmonics is lower the fewer there are, as that of the asset is: view dependence is overfitted. Share for each, least and most.
 HARMONICS_PER_VIEW, LEAST_HARMONICS, MOST_HARMONICS = 1 / 320, 0.25, 0.75
-STRUCTURE = 0.005  # of `Picture`
+STRUCTURE, HUBER_DELTA = 0.005, 0.08  # of `Picture`
 PIXELS = 2**18  # of a step
 COARSE_UNTIL, COARSE_PIXELS = 0.3, 2**17  # of the steps: until then, pictures of so many pixels and more are taken at half their size
 LAST_RATE = 0.1  # of the learning rates, at the last step
@@ -162,7 +163,8 @@ def _picture(view: View, background: tuple[float, float, float] | None) -> Pictu
     if pixels.shape[2] == 3:
         pixels = np.concatenate([pixels, np.full((*pixels.shape[:2], 1), 255, np.uint8)], axis=2)
     mask = np.ones(pixels.shape[:2], np.uint8) if view.mask is None else np.ascontiguousarray(view.mask).view(np.uint8)
-    return Picture(np.ascontiguousarray(pixels), mask, over_all, np.asarray(background or (0, 0, 0), np.float32), np.float32(STRUCTURE))
+    behind = np.asarray(background or (0, 0, 0), np.float32)
+    return Picture(np.ascontiguousarray(pixels), mask, over_all, behind, np.float32(STRUCTURE), np.float32(HUBER_DELTA))
 
 
 def _moved(lens: Lens, picture: Picture, right: int, down: int) -> tuple[Lens, Picture]:

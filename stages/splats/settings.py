@@ -48,5 +48,5 @@ class SplatsSettings:
 
 
 STAGE = Stage(
-    name="splats", version=16, settings=SplatsSettings, needs=("bake", "train", "poses"), run=ByName("stages.splats.run:run"), uses_device=True,
+    name="splats", version=17, settings=SplatsSettings, needs=("bake", "train", "poses"), run=ByName("stages.splats.run:run"), uses_device=True,
 )  # fmt: skip

@@ -39,14 +39,15 @@ def tensors(gaussians: Gaussians) -> list[Tensor]:
     return [torch.tensor(part, dtype=torch.float64, requires_grad=True) for part in parts]
 
 
-def picture_of(seed: int, over_all: bool, structure: float = 0.0) -> Picture:
+def picture_of(seed: int, over_all: bool, structure: float = 0.0, huber_delta: float = np.inf) -> Picture:
     rng = np.random.default_rng(seed)
     mask = (rng.random((HEIGHT, WIDTH)) < 0.97).astype(np.uint8)
-    return Picture(rng.integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8), mask, over_all, np.array([0.2, 0.5, 0.9], np.float32), np.float32(structure))
+    pixels, background = rng.integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8), np.array([0.2, 0.5, 0.9], np.float32)
+    return Picture(pixels, mask, over_all, background, np.float32(structure), np.float32(huber_delta))
 
 
 def reference_loss(image: Tensor, light: Tensor, picture: Picture) -> Tensor:
-    """Half of the squared error, and of the structural dissimilarity."""
+    """Half of the squared error, or the pseudo-Huber loss of it, and half of the structural dissimilarity."""
     pixels, mask = torch.tensor(picture.pixels / 255.0), torch.tensor(picture.mask != 0)
     if not picture.over_all:
         background = torch.tensor(picture.background, dtype=image.dtype)
@@ -57,7 +58,9 @@ def reference_loss(image: Tensor, light: Tensor, picture: Picture) -> Tensor:
         more = light[..., None] - (1 - alpha)
         off, wanted = image - pixels[..., :3] * alpha + 0.5 * more, pixels[..., :3] * alpha + 0.5 * (1 - alpha)
         squares = off.square() + more.square() / 12
-    return 0.5 * ((squares.sum(-1) * mask).sum() + float(picture.structure) * structural_dissimilarity(wanted + off, wanted, mask))
+    error, delta = squares.sum(-1), float(picture.huber_delta)
+    losses = error if np.isinf(delta) else 2 * delta**2 * ((1 + error / delta**2).sqrt() - 1)
+    return 0.5 * ((losses * mask).sum() + float(picture.structure) * structural_dissimilarity(wanted + off, wanted, mask))
 
 
 def structural_dissimilarity(image: Tensor, wanted: Tensor, mask: Tensor) -> Tensor:

@@ -41,14 +41,14 @@ def test_images_and_steps_are_those_of_the_host(model: str, extra: tuple[float, 
     fits = device.SplatFit(rows, moments, degree, DEVICE), host.SplatFit(rows, moments, degree)
     for number in range(2):
         for fit in fits:
-            fit.step(lens, picture_of(number, over_all, 0.3), rates_of(0.1 * number, 0.004))
+            fit.step(lens, picture_of(number, over_all, 0.3, 0.2), rates_of(0.1 * number, 0.004))
     agree(fits[0].state(), fits[1].state())
     assert fits[0].state().moments[:, 0].max() == 2
 
 
 def test_gradients_are_those_of_the_plain_sums() -> None:
     """Read from the moments after one step."""
-    gaussians, picture = some_gaussians(31, 3), picture_of(1, True, 0.3)
+    gaussians, picture = some_gaussians(31, 3), picture_of(1, True, 0.3, 0.2)
     fit = device.SplatFit(*begun(gaussians), 3, DEVICE)
     fit.step(lens_of(camera()), picture, rates_of(0.0, 0.004))
     found = fit.state().moments[:, GRADIENTS:] / (1 - refit.MOMENTUM)

@@ -54,9 +54,11 @@ def step_gradients(values, lens, degree, first, sums, out):  # type: ignore[no-u
                 out[group, row, lane] = gradient[16 * row + lane]
 
 
-@pytest.mark.parametrize(("degree", "over_all", "structure"), [(2, True, 0.0), (3, False, 0.0), (0, True, 0.3), (1, False, 0.3)])
-def test_gradients_are_those_of_the_plain_sums(degree: int, over_all: bool, structure: float) -> None:
-    gaussians, picture = some_gaussians(count=53, degree=degree), picture_of(1, over_all, structure)
+@pytest.mark.parametrize(
+    ("degree", "over_all", "structure", "huber_delta"), [(2, True, 0.0, np.inf), (3, False, 0.0, 0.2), (0, True, 0.3, 0.2), (1, False, 0.3, np.inf)]
+)
+def test_gradients_are_those_of_the_plain_sums(degree: int, over_all: bool, structure: float, huber_delta: float) -> None:
+    gaussians, picture = some_gaussians(count=53, degree=degree), picture_of(1, over_all, structure, huber_delta)
     values, lens = grouped(values_of(gaussians)), lens_of(camera())
     records = np.zeros((16 * len(values), RECORD), np.float32)
     pairs = projected(values, lens, degree, records)
@@ -69,9 +71,10 @@ def test_gradients_are_those_of_the_plain_sums(degree: int, over_all: bool, stru
     wanted = tensors(gaussians)
     loss = reference_loss(*render_reference(*wanted, camera()), picture)
     loss.backward()
-    squared = reference_loss(*render_reference(*wanted, camera()), picture._replace(structure=np.float32(0)))
+    image = render_reference(*wanted, camera())
+    squared = reference_loss(*image, picture._replace(structure=np.float32(0), huber_delta=np.float32(np.inf)))
     assert 0.5 * errors.sum() == pytest.approx(squared.item(), rel=1e-5)
-    assert (loss.item() > 1.1 * squared.item()) == (structure > 0)
+    assert (loss.item() > 1.1 * reference_loss(*image, picture._replace(structure=np.float32(0))).item()) == (structure > 0)
     for name, part, leaf in zip(("means", "scales", "rotations", "logits", "harmonics"), np.split(rows, [3, 6, 10, 11], axis=1), wanted, strict=True):
         gradient = leaf.grad.reshape(len(gaussians), -1).numpy()
         np.testing.assert_allclose(part, gradient, rtol=2e-3, atol=2e-4 * np.abs(gradient).max(), err_msg=name)

@@ -110,28 +110,34 @@ def _render(begin, end, workers, task, records, pairs, longest, colour, transmit
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _add_structure(p, picture):
-    """Half of the derivatives of 1 - SSIM of a block, which is a window of it, added to those of its squared error; p: pointer to `slopes`."""
-    share, by_light = _ONE / np.float32(LANES), load(p, 48, LANES)
+def _loss_slopes(p, picture, structure):
+    """Half of the derivatives of a block's squared error become those of its loss; with structure, 1 - SSIM of the block, which is a window of it, is in
+    that; p: pointer to `slopes`."""
+    share, weight = _ONE / np.float32(LANES), load(p, 128, LANES)
+    by_light = load(p, 48, LANES) * weight
     for channel in range(3):
         difference, y = load(p, 16 * channel, LANES), load(p, 80 + 16 * channel, LANES)
-        x = y + difference
-        of_x, of_y = sum_lanes(x) * share, sum_lanes(y) * share
-        x, y = x - of_x, y - of_y
-        change = _structure_change(x, y, of_x, of_y, sum_lanes(x * x + y * y) * share, sum_lanes(x * y) * share, _C1, _C2, _TWO)
-        store(p, 16 * channel, difference - change * picture.structure)
-        by_light = by_light - change * (picture.structure * (_HALF if picture.over_all else picture.background[channel]))
+        slope = difference * weight
+        if structure:
+            x = y + difference
+            of_x, of_y = sum_lanes(x) * share, sum_lanes(y) * share
+            x, y = x - of_x, y - of_y
+            change = _structure_change(x, y, of_x, of_y, sum_lanes(x * x + y * y) * share, sum_lanes(x * y) * share, _C1, _C2, _TWO)
+            slope = slope - change * picture.structure
+            by_light = by_light - change * (picture.structure * (_HALF if picture.over_all else picture.background[channel]))
+        store(p, 16 * channel, slope)
     store(p, 48, by_light)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _residual(left, top, place, picture, slopes):
-    """The squared error of a block, whose colours and transmittances are in `place`. Half of the derivatives of the error, structure included, go into the
-    first 64 of `slopes`, each pixel's squared error into the next 16, and the colours wanted, over grey or the background, into the last 48.
+    """The squared error of a block, whose colours and transmittances are in `place`. Derivatives of the loss, structure included, go into the first 64 of
+    `slopes`, each pixel's squared error into the next 16, the colours wanted, over grey or the background, into the next 48, and the loss's weights of the
+    pixels into the last 16.
 
     Over all backgrounds b from 0 to 1, d + t b has the mean square (d + t / 2)^2 + t^2 / 12: d a channel's difference, t that of the transmittances.
     """
-    total, all_count = 0.0, True
+    total, all_count, per_delta = 0.0, True, _ONE / (picture.huber_delta * picture.huber_delta)
     height, width = picture.mask.shape
     for lane in range(16):
         i, j = top + lane // BLOCK, left + lane % BLOCK
@@ -154,11 +160,10 @@ def _residual(left, top, place, picture, slopes):
                     by_light += slope * picture.background[channel]
                     error += slope * slope
             slopes[16 * channel + lane], slopes[80 + 16 * channel + lane] = slope, over_ground
-        slopes[48 + lane], slopes[64 + lane] = by_light, error
+        slopes[48 + lane], slopes[64 + lane], slopes[128 + lane] = by_light, error, _ONE / np.sqrt(_ONE + error * per_delta)
         total += float(error)
         all_count &= counts
-    if all_count and picture.structure > _NONE:
-        _add_structure(pointer(slopes), picture)
+    _loss_slopes(pointer(slopes), picture, all_count and picture.structure > _NONE)
     return total
 
 
@@ -207,7 +212,7 @@ def _fit_tile(tile, p, pairs, picture, met, place, slopes, xs, ys, sums):
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _fit(begin, end, workers, task, records, pairs, longest, picture, sums, errors):
     for _ in numba.prange(workers):
-        met, place, slopes = np.empty(longest, np.int64), np.empty(64, np.float32), np.empty(128, np.float32)
+        met, place, slopes = np.empty(longest, np.int64), np.empty(64, np.float32), np.empty(144, np.float32)
         xs, ys = np.empty(16, np.float32), np.empty(16, np.float32)
         tile = begin + fetch_add(pointer(task), 0, 1)
         while tile < end:
@@ -226,7 +231,7 @@ def render_tiles(tiles: slice, records: np.ndarray, pairs: Pairs, colour: np.nda
 
 
 def fit_tiles(tiles: slice, records: np.ndarray, pairs: Pairs, picture: Picture, sums: np.ndarray, errors: np.ndarray) -> None:
-    """The squared error of each of some tiles in `errors` (T,) float64, and sums of half of its derivatives by their pairs, structure included, in `sums`
+    """The squared error of each of some tiles in `errors` (T,) float64, and sums of the loss's derivatives by their pairs, structure included, in `sums`
     (P, SUMS) float32."""
     workers = min(numba.get_num_threads(), tiles.stop - tiles.start)
     _fit(tiles.start, tiles.stop, workers, np.zeros(1, np.int64), records, pairs, _longest(pairs), picture, sums, errors)

@@ -71,7 +71,7 @@ class SplatFit:
         records, tiles, pairs = projected(self.values, lens, self._degree)
         pixels, mask = (to_device(torch.tensor(part), self.values.device) for part in (picture.pixels, picture.mask))
         sums = torch.zeros(len(records), layout.SUMS, device=self.values.device)
-        target = Target(pixels, mask, tuple(picture.background.tolist()), float(picture.structure))
+        target = Target(pixels, mask, tuple(picture.background.tolist()), float(picture.structure), float(picture.huber_delta))
         raster.fit_tiles[(len(pairs.begin) - 1, raster.BLOCKS)](
             records, pairs, target, sums, lens.width, lens.height, OVER_ALL=picture.over_all, num_warps=1
         )  # fmt: skip

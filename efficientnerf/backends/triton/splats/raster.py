@@ -35,12 +35,13 @@ class Pairs(NamedTuple):
 
 
 class Target(NamedTuple):
-    """`splat_layout.Picture`: pixels (H, W, 4) and mask (H, W) uint8, background: three floats, structure: a float."""
+    """`splat_layout.Picture`: pixels (H, W, 4) and mask (H, W) uint8, background: three floats, structure and huber_delta: floats."""
 
     pixels: Any
     mask: Any
     background: Any
     structure: Any
+    huber_delta: Any
 
 
 class Block(NamedTuple):
@@ -166,14 +167,13 @@ def _structure_slope(difference, y, whole, weight):
 
 
 @triton.jit
-def _slopes(found, light, at, counts, whole, picture, CHANNEL: tl.constexpr, OVER_ALL: tl.constexpr):
-    """`_slope` with structure: half of the derivatives by a channel and by the transmittance, and the squared error."""
-    slope, by_light, error, wanted = _slope(found, light, at, counts, picture, CHANNEL, OVER_ALL)
+def _with_structure(slope, by_light, wanted, weight, whole, picture, CHANNEL: tl.constexpr, OVER_ALL: tl.constexpr):
+    """Derivatives of the loss by a channel and by the transmittance, of what `_slope` found; weight: the loss's, of the pixels."""
     change = _structure_slope(slope, wanted, whole, picture.structure)
     if OVER_ALL:
-        return slope + change, by_light + 0.5 * change, error
+        return slope * weight + change, by_light * weight + 0.5 * change
     else:
-        return slope + change, by_light + change * picture.background[CHANNEL], error
+        return slope * weight + change, by_light * weight + change * picture.background[CHANNEL]
 
 
 @triton.jit
@@ -195,16 +195,20 @@ def _pull(c, by, error, sums, v):
 
 @triton.jit(do_not_specialize=["width", "height"])
 def fit_tiles(records, pairs, picture, sums, width, height, OVER_ALL: tl.constexpr):
-    """Sums of half of the error's derivatives added to `sums` (N, SUMS)."""
+    """Sums of the loss's derivatives added to `sums` (N, SUMS)."""
     block = _block(pairs, width, height)
     found, light, last = _blend(records, pairs, block)
     at = block.i * width + block.j
     counts = block.inside & (tl.load(picture.mask + at, block.inside, other=0) != 0)
     whole = _window_mean(counts.to(tl.float32)) > 0.99
-    by_red, light_red, red_error = _slopes(found.x, light, at, counts, whole, picture, 0, OVER_ALL)
-    by_green, light_green, green_error = _slopes(found.y, light, at, counts, whole, picture, 1, OVER_ALL)
-    by_blue, light_blue, blue_error = _slopes(found.z, light, at, counts, whole, picture, 2, OVER_ALL)
+    by_red, light_red, red_error, red = _slope(found.x, light, at, counts, picture, 0, OVER_ALL)
+    by_green, light_green, green_error, green = _slope(found.y, light, at, counts, picture, 1, OVER_ALL)
+    by_blue, light_blue, blue_error, blue = _slope(found.z, light, at, counts, picture, 2, OVER_ALL)
     error = red_error + green_error + blue_error
+    weight = 1 / tl.sqrt(1 + error / (picture.huber_delta * picture.huber_delta))
+    by_red, light_red = _with_structure(by_red, light_red, red, weight, whole, picture, 0, OVER_ALL)
+    by_green, light_green = _with_structure(by_green, light_green, green, weight, whole, picture, 1, OVER_ALL)
+    by_blue, light_blue = _with_structure(by_blue, light_blue, blue, weight, whole, picture, 2, OVER_ALL)
     behind = found.x * by_red + found.y * by_green + found.z * by_blue + light * (light_red + light_green + light_blue)
     through = tl.where(block.inside, 1.0, 0.0)
     base = block.first
