@@ -94,7 +94,7 @@ class Provenance(Struct, frozen=True, omit_defaults=True):
     matching: str | None = None  # the pairs that were matched, as the setting has it
     components: list[int] | None = None  # photographs of each group that overlaps with no other, the largest first
     models: list[int] | None = None  # photographs of each sub-model that adds to the first
-    rungs: list[dict[str, object]] | None = None  # `stages.sfm.attempts.Search`
+    attempts: list[dict[str, object]] | None = None  # `tried` of `stages.sfm.attempts.Search`
     planar_pairs: float | UnsetType | None = UNSET  # share of the pairs whose matches one homography explains; None: there are no pairs
     lens: Lens | None = None  # photographs that were zoomed have a focal length each, cropped ones a principal point
     own_intrinsics: str | UnsetType | None = UNSET  # which each photograph has of its own (`stages.sfm.intrinsics.own`), if any

@@ -124,7 +124,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="poses",
-    version=20,
+    version=21,
     settings=PosesSettings,
     needs=(),
     run=ByName("stages.poses.run:run"),

@@ -25,7 +25,7 @@ MORE_FEATURES, LESS_CONTRAST = 2, 0.35
 OWN_FOCAL_LENGTHS, OWN_PRINCIPAL_POINTS, MERGED = "a focal length each", "a principal point each", "merged sub-models"
 BEGIN_ANEW, SMALL_ANGLES = "another beginning", "small angles"
 NETWORK, NETWORK_ANEW = "matches by a network", "another beginning with matches by a network"
-MATCHED_AGAIN, NETWORKS, OWN_CAMERAS = "rungs", "networks", "own_cameras"  # scratch folders
+MATCHED_AGAIN, NETWORKS, OWN_CAMERAS = "matched_again", "networks", "own_cameras"  # scratch folders
 MAX_AGREEMENT_LOSS = 0.02  # of the matches, that fewer may agree when sub-models are merged: a false place contradicts the matches between them
 MIN_FOCAL_SPREAD = 1.08  # between the focal lengths of single photographs, from which they may have been zoomed
 MIN_MIDDLE_SPREAD = 0.009  # of the longest side, between the principal points of single photographs, from which they may have been cropped
@@ -76,7 +76,7 @@ class Search:
         """Keep an attempt's result where its score, the number of photographs with a camera times the share of the matches that agree, is `better` times
         the best, and at least the share `least` agrees."""
         agreement, count = mapping.match_agreement(self.place, models[0]) if models else 0.0, mapping.num_registered(models)
-        self.tried.append({"rung": name, "registered": count, "agreeing": round(agreement, 4)})
+        self.tried.append({"step": name, "registered": count, "agreeing": round(agreement, 4)})
         if count * agreement > better * self._score and agreement >= least:
             self._score, self.agreement = count * agreement, agreement
             self.models, self.best, self.work = models, name, self.place
@@ -107,11 +107,11 @@ class Search:
         return mapping.num_registered(self.models) >= MIN_REGISTERED * len(self.images) and self.agreement >= MIN_AGREEING
 
     def was_last(self, name: str) -> bool:
-        return self.tried[-1]["rung"] == name
+        return self.tried[-1]["step"] == name
 
     def begun_anew(self) -> bool:
         """Whether the mapper has begun anew from these matches."""
-        return self.place == self.base and any(attempt["rung"] == BEGIN_ANEW for attempt in self.tried)
+        return self.place == self.base and any(attempt["step"] == BEGIN_ANEW for attempt in self.tried)
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ def provenance_of(search: Search, matching: str) -> Provenance:
         matching=matching,
         components=[len(part) for part in components(neighbours(search.work, len(search.images)))],
         models=[len(part) for part in parts if part is parts[0] or part - parts[0]],
-        rungs=search.tried,
+        attempts=search.tried,
         planar_pairs=planar_share(database_path(search.work)),
         lens=OWN_LENSES.get(search.best),
     )

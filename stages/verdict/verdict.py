@@ -23,7 +23,7 @@ from stages.verdict.parallax import Parallax, parallax
 
 # Of a capture's provenance, that stand among the figures.
 FIGURES = (
-    "matching", "components", "models", "pairs_agreeing", "planar_pairs", "rungs", "lens", "own_intrinsics", "gps", "stated_cameras", "background",
+    "matching", "components", "models", "pairs_agreeing", "planar_pairs", "attempts", "lens", "own_intrinsics", "gps", "stated_cameras", "background",
 )  # fmt: skip
 NEAREST = 3  # registered photographs that are listed for one that is not registered
 FEW = 12  # views all round a subject

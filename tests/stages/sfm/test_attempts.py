@@ -27,7 +27,7 @@ class Rig:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, outcomes: dict[str, tuple[int, float]]) -> None:
         self.outcomes, self.tried, self.weak = outcomes, list[str](), list[list[int]]()
-        self._rung, self.spread, self.apart = "exhaustive", 1.0, 0.001
+        self._step, self.spread, self.apart = "exhaustive", 1.0, 0.001
         monkeypatch.setattr(mapping, "sub_models", lambda work, images, seed, options, *a, **k: self.model(work, "begin", options))
         monkeypatch.setattr(mapping, "continued", lambda work, images, model, seed, *a, **k: self.model(work, "continue", mapping.RELAXED))
         monkeypatch.setattr(mapping, "match_agreement", self.agreement)
@@ -45,29 +45,29 @@ class Rig:
         return float(model.agreeing)
 
     def match_again(self, search: Search, name: str) -> None:
-        self._rung = {"wider_": "wider matching", "more_": "more features"}[name]
+        self._step = {"wider_": "wider matching", "more_": "more features"}[name]
         self.weak.append(search.missing)
 
     def model(self, work: Path, how: str, options: Any) -> list[Any]:
         if work.name == "own_cameras":
             name = attempts.OWN_PRINCIPAL_POINTS if how == "adjust" else attempts.OWN_FOCAL_LENGTHS
-        elif work.name == "rungs" and how == "begin" and self._rung == "beyond":
+        elif work.name == attempts.MATCHED_AGAIN and how == "begin" and self._step == "beyond":
             name = "small angles" if options is mapping.FORWARD else "another beginning"
         elif work.name == "networks":
             name = attempts.NETWORK if how == "continue" else attempts.NETWORK_ANEW
-        elif how == "continue" and work.name != "rungs":
+        elif how == "continue" and work.name != attempts.MATCHED_AGAIN:
             name = "fewer matches"
-        elif how == "begin" and options is not mapping.DEFAULTS and self._rung in ("exhaustive", "more features"):
+        elif how == "begin" and options is not mapping.DEFAULTS and self._step in ("exhaustive", "more features"):
             name = "small angles" if options is mapping.FORWARD else "another beginning"
         else:
-            name = self._rung
+            name = self._step
         self.tried.append(name)
         count, agreeing = self.outcomes.get(name, (0, 0.0))
         if not count:
             return []
         images = {k: SimpleNamespace(name=IMAGES[k].file, has_pose=True) for k in range(count)}
         error = 0.3 if name == attempts.OWN_PRINCIPAL_POINTS else 0.5
-        return [SimpleNamespace(images=images, num_reg_images=lambda: count, agreeing=agreeing, rung=name, compute_mean_reprojection_error=lambda: error)]
+        return [SimpleNamespace(images=images, num_reg_images=lambda: count, agreeing=agreeing, step=name, compute_mean_reprojection_error=lambda: error)]
 
 
 def climbed(rig: Rig, tmp_path: Path) -> Search:
@@ -78,16 +78,16 @@ def test_attempts_go_on_until_enough_have_a_camera_and_the_best_is_kept(monkeypa
     rig = Rig(monkeypatch, {"exhaustive": (8, 0.95), "fewer matches": (9, 0.95), "wider matching": (11, 0.94), "more features": (19, 0.93)})
     found = climbed(rig, tmp_path)
     assert rig.tried == ["exhaustive", "fewer matches", *ANEW, "wider matching", "more features", attempts.OWN_FOCAL_LENGTHS]
-    assert [rung["registered"] for rung in found.tried] == [8, 9, 0, 0, 11, 19, 0]
+    assert [attempt["registered"] for attempt in found.tried] == [8, 9, 0, 0, 11, 19, 0]
     assert rig.weak == [list(range(9, 20)), list(range(11, 20)), list(range(11, 20))]
-    assert (found.models[0].rung, found.work) == ("more features", tmp_path / "rungs")
+    assert (found.models[0].step, found.work) == ("more features", tmp_path / attempts.MATCHED_AGAIN)
 
 
 def test_more_photographs_that_contradict_their_matches_are_not_better(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     rig = Rig(monkeypatch, {"exhaustive": (12, 0.95), "more features": (20, 0.4), "another beginning": (14, 0.9)})
     found = climbed(rig, tmp_path)
     assert rig.tried == ["exhaustive", "fewer matches", "wider matching", "more features", "another beginning", "small angles", attempts.OWN_FOCAL_LENGTHS]
-    assert found.models[0].rung == found.best == "another beginning"
+    assert found.models[0].step == found.best == "another beginning"
 
 
 @pytest.mark.parametrize(("each", "kept"), [((20, 0.97), True), ((20, 0.92), False), ((10, 0.99), False)])
@@ -97,7 +97,7 @@ def test_own_focal_lengths_are_kept_where_they_explain_disagreement(
     rig = Rig(monkeypatch, {"exhaustive": (20, 0.9), attempts.OWN_FOCAL_LENGTHS: each})
     found = climbed(rig, tmp_path)
     assert rig.tried == ["exhaustive", attempts.OWN_FOCAL_LENGTHS]
-    assert found.tried[-1] == {"rung": attempts.OWN_FOCAL_LENGTHS, "registered": each[0], "agreeing": each[1]}
+    assert found.tried[-1] == {"step": attempts.OWN_FOCAL_LENGTHS, "registered": each[0], "agreeing": each[1]}
     assert (found.best, found.work) == ((attempts.OWN_FOCAL_LENGTHS, tmp_path / "own_cameras") if kept else ("exhaustive", tmp_path))
 
 
@@ -106,7 +106,7 @@ def test_own_principal_points_are_kept_where_points_lie_closer(monkeypatch: pyte
     rig = Rig(monkeypatch, {"exhaustive": (20, 0.98), attempts.OWN_FOCAL_LENGTHS: (20, 0.98), attempts.OWN_PRINCIPAL_POINTS: cropped})
     rig.apart = 0.01
     found = climbed(rig, tmp_path)
-    assert [rung["rung"] for rung in found.tried] == ["exhaustive", attempts.OWN_PRINCIPAL_POINTS]
+    assert [attempt["step"] for attempt in found.tried] == ["exhaustive", attempts.OWN_PRINCIPAL_POINTS]
     assert found.best == (attempts.OWN_PRINCIPAL_POINTS if kept else "exhaustive")
 
 
@@ -125,9 +125,9 @@ def test_networks_come_last_and_for_photographs_without_a_camera_alone(
     monkeypatch.setattr(attempts, "add_matches", lambda place, images, wanted, networks, **k: compared.append(wanted))
     monkeypatch.setattr(merging, "triangulated", lambda place, images, models, *a, **k: models[0])
     found = find_models(Search(tmp_path, IMAGES, 0, 100, 1, networks=(tmp_path / "a", tmp_path / "b"), **QUIET), "exhaustive")
-    rungs = [rung["rung"] for rung in found.tried]
-    assert [rung for rung in rungs if "network" in str(rung)] == tried
-    assert [rung for rung in found.tried if rung["rung"] not in tried] == without.tried
+    steps = [attempt["step"] for attempt in found.tried]
+    assert [step for step in steps if "network" in str(step)] == tried
+    assert [attempt for attempt in found.tried if attempt["step"] not in tried] == without.tried
     assert (tmp_path / "networks").exists() == bool(tried)
     weak = set(range(registered, 20))
     assert compared == ([[(i, j) for i, j in sorted(pairs.all_pairs(20)) if {i, j} & weak]] if tried else [])
@@ -141,9 +141,9 @@ def test_a_faint_photograph_gets_its_camera_by_more_features(tmp_path: Path) -> 
             faint = np.asarray(image.filter(ImageFilter.GaussianBlur(1.0)), np.float32) * 0.15 + 85
             (Image.fromarray(faint.astype(np.uint8)) if name == names[2] else image).save(tmp_path / name, quality=95)
     capture = find_cameras(Request(tmp_path, {name: tmp_path / name for name in names}, tmp_path / "work", 360), **SILENT)
-    rungs = {rung["rung"]: rung["registered"] for rung in capture.provenance.rungs}
-    assert rungs["exhaustive"] == rungs["wider matching"] == 5
-    assert rungs["more features"] == 6
+    tried = {attempt["step"]: attempt["registered"] for attempt in capture.provenance.attempts}
+    assert tried["exhaustive"] == tried["wider matching"] == 5
+    assert tried["more features"] == 6
     assert errors_of(capture).max() < 0.02
 
 
@@ -156,6 +156,6 @@ def test_what_was_tried_is_in_the_verdict_of_a_failure(tmp_path: Path) -> None:
         find_cameras(Request(tmp_path, {f"{k}.png": tmp_path / f"{k}.png" for k in range(3)}, tmp_path / "work"), **SILENT)
     said = read_json(tmp_path / "work/verdict.json")
     assert said["grade"] == "failed"
-    assert [rung["rung"] for rung in said["rungs"]] == ["exhaustive", *ANEW, "wider matching", "more features", *ANEW]
+    assert [attempt["step"] for attempt in said["attempts"]] == ["exhaustive", *ANEW, "wider matching", "more features", *ANEW]
     assert set(said["images"]) == {"0.png", "1.png", "2.png"}
     assert not said["images"]["0.png"]["registered"]

@@ -127,8 +127,8 @@ def test_a_merge_that_contradicts_the_matches_is_refused(scene: tuple[Path, list
     monkeypatch.setattr(merging, "similarity_of", false_place)
     found = climbed(scene, parts, monkeypatch)
     assert asked
-    rungs = {str(rung["rung"]): rung for rung in found.tried}
-    assert rungs[attempts.MERGED]["agreeing"] < rungs["exhaustive"]["agreeing"] - attempts.MAX_AGREEMENT_LOSS  # type: ignore[operator]
+    tried = {str(attempt["step"]): attempt for attempt in found.tried}
+    assert tried[attempts.MERGED]["agreeing"] < tried["exhaustive"]["agreeing"] - attempts.MAX_AGREEMENT_LOSS  # type: ignore[operator]
     assert found.best == "exhaustive"
     assert found.models[0].num_reg_images() == 5
     errors = aligned_errors(np.array([image.projection_center() for image in registered(found.models[0])]), np.array([c.centre for c in TRUTH[:5]]))

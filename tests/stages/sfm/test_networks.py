@@ -106,7 +106,7 @@ def test_a_photograph_without_sift_features_gets_its_camera(tmp_path: Path, monk
     asked = [Request(STILL_LIFE, paths, tmp_path / f"with {threads}", 360, 4096, threads=threads, networks=networks) for threads in (1, 2)]
     found = [reconstruct(request, **SILENT) for request in asked]
     assert [name for name, _ in usual.rejected] == [names[2]]
-    before, after = (list(capture.provenance.rungs) for capture in (usual, found[0]))
+    before, after = (list(capture.provenance.attempts) for capture in (usual, found[0]))
     assert after[: len(before)] == before, "what is tried before it is the same"
     assert found[0].rejected == ()
     assert errors_of(found[0]).max() < 0.02

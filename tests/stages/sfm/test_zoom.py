@@ -30,8 +30,8 @@ def test_a_zoom_that_changed_gives_each_photograph_its_focal_length(tmp_path: Pa
     taken = cameras(ZOOMED)
     images = matched(tmp_path, taken)
     found = found_for(tmp_path, images)
-    assert [rung["rung"] for rung in found.tried] == ["exhaustive", attempts.OWN_FOCAL_LENGTHS]
-    one, each = (float(rung["agreeing"]) for rung in found.tried)  # type: ignore[arg-type]
+    assert [attempt["step"] for attempt in found.tried] == ["exhaustive", attempts.OWN_FOCAL_LENGTHS]
+    one, each = (float(attempt["agreeing"]) for attempt in found.tried)  # type: ignore[arg-type]
     assert one < DOUBTFUL < 0.98 < each
     assert (found.best, found.work) == (attempts.OWN_FOCAL_LENGTHS, tmp_path / "own_cameras")
     model = found.models[0]
