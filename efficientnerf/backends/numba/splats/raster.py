@@ -17,7 +17,7 @@ from efficientnerf.backends.layout import SSIM_C1, SSIM_C2
 from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.splats.pairs import BLOCK, Pairs
 from efficientnerf.backends.numba.splats.projection import LANES
-from efficientnerf.backends.numba.vector.maths import LOG2_E, bits_of, broadcast, exp2_neg, mask_of, maximum, minimum, select, sum_each, sum_lanes
+from efficientnerf.backends.numba.vector.maths import LOG2_E, bits_of, broadcast, exp2_neg, mask_of, maximum, minimum, select, sqrt, sum_each, sum_lanes
 from efficientnerf.backends.numba.vector.memory import fetch_add, load, load_three, pointer, store, store_three
 from efficientnerf.backends.splat_layout import RECORD, SUMS, TILE, Picture
 from efficientnerf.backends.structure import structure_change
@@ -113,7 +113,8 @@ def _render(begin, end, workers, task, records, pairs, longest, colour, transmit
 def _loss_slopes(p, picture, structure):
     """Half of the derivatives of a block's squared error become those of its loss; with structure, 1 - SSIM of the block, which is a window of it, is in
     that; p: pointer to `slopes`."""
-    share, weight = _ONE / np.float32(LANES), load(p, 128, LANES)
+    share, per_delta = _ONE / np.float32(LANES), _ONE / (picture.huber_delta * picture.huber_delta)
+    weight = _ONE / sqrt(load(p, 64, LANES) * per_delta + _ONE)
     by_light = load(p, 48, LANES) * weight
     for channel in range(3):
         difference, y = load(p, 16 * channel, LANES), load(p, 80 + 16 * channel, LANES)
@@ -132,12 +133,11 @@ def _loss_slopes(p, picture, structure):
 @numba.njit(cache=True, error_model="numpy")
 def _residual(left, top, place, picture, slopes):
     """The squared error of a block, whose colours and transmittances are in `place`. Derivatives of the loss, structure included, go into the first 64 of
-    `slopes`, each pixel's squared error into the next 16, the colours wanted, over grey or the background, into the next 48, and the loss's weights of the
-    pixels into the last 16.
+    `slopes`, each pixel's squared error into the next 16, and the colours wanted, over grey or the background, into the last 48.
 
     Over all backgrounds b from 0 to 1, d + t b has the mean square (d + t / 2)^2 + t^2 / 12: d a channel's difference, t that of the transmittances.
     """
-    total, all_count, per_delta = 0.0, True, _ONE / (picture.huber_delta * picture.huber_delta)
+    total, all_count = 0.0, True
     height, width = picture.mask.shape
     for lane in range(16):
         i, j = top + lane // BLOCK, left + lane % BLOCK
@@ -160,7 +160,7 @@ def _residual(left, top, place, picture, slopes):
                     by_light += slope * picture.background[channel]
                     error += slope * slope
             slopes[16 * channel + lane], slopes[80 + 16 * channel + lane] = slope, over_ground
-        slopes[48 + lane], slopes[64 + lane], slopes[128 + lane] = by_light, error, _ONE / np.sqrt(_ONE + error * per_delta)
+        slopes[48 + lane], slopes[64 + lane] = by_light, error
         total += float(error)
         all_count &= counts
     _loss_slopes(pointer(slopes), picture, all_count and picture.structure > _NONE)
@@ -212,7 +212,7 @@ def _fit_tile(tile, p, pairs, picture, met, place, slopes, xs, ys, sums):
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def _fit(begin, end, workers, task, records, pairs, longest, picture, sums, errors):
     for _ in numba.prange(workers):
-        met, place, slopes = np.empty(longest, np.int64), np.empty(64, np.float32), np.empty(144, np.float32)
+        met, place, slopes = np.empty(longest, np.int64), np.empty(64, np.float32), np.empty(128, np.float32)
         xs, ys = np.empty(16, np.float32), np.empty(16, np.float32)
         tile = begin + fetch_add(pointer(task), 0, 1)
         while tile < end:
