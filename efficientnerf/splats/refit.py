@@ -32,7 +32,8 @@ LAST_RATE = 0.1  # of the learning rates, at the last step
 MOMENTUM, DECAY, EPSILON = 0.9, 0.99, 1e-6
 NOISE = 0.05  # of `Rates`, at the first step
 FADE, MOST_FADE = 9.0, 0.015  # the same, over the number of steps, and at most
-LEAST_OPACITY = 0.005  # below which a Gaussian is left out; 3DGS
+LEAST_OPACITY = 0.005  # below which a Gaussian is replaced; 3DGS
+FAINT = 0.02  # opacity, below which a Gaussian is left out at the end. docs/experiments/splats.md
 SPLIT_AT = (0.25, 0.5)  # of the steps: when Gaussians are divided where the error is, up to the most allowed
 # Of so many steps and more: when that is done, and the share, of the most transparent, that is left out for it each time. 3DGS-MCMC relocates dead ones.
 MANY_STEPS = 1200
@@ -107,7 +108,7 @@ def refitted(
         if reached is not None:
             reached(number + 1)
     fitted = gaussians_from(fit.state().rows)
-    return fitted.subset(fitted.opacities >= LEAST_OPACITY)
+    return fitted.subset(fitted.opacities >= FAINT)
 
 
 def _fade(steps: int) -> float:

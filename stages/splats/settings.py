@@ -24,7 +24,7 @@ class SplatsSettings:
     region: Literal["foreground", "all"] = setting(
         "all", "What becomes Gaussians: the whole scene with its surroundings (all), or the subject and what it stands on (foreground).", advanced=True
     )
-    count: Annotated[int, Meta(ge=1, le=MAX_COUNT)] = setting(300_000, "Maximum number of Gaussians; no more are made than an image has pixels.", advanced=True)
+    count: Annotated[int, Meta(ge=1, le=MAX_COUNT)] = setting(280_000, "Maximum number of Gaussians; no more are made than an image has pixels.", advanced=True)
     sh_degree: Annotated[int, Meta(ge=0, le=3)] = setting(2, "Degree of the spherical harmonics of their colours.", advanced=True)
     iterations: Count | Auto = setting(
         "auto",
@@ -48,5 +48,5 @@ class SplatsSettings:
 
 
 STAGE = Stage(
-    name="splats", version=17, settings=SplatsSettings, needs=("bake", "train", "poses"), run=ByName("stages.splats.run:run"), uses_device=True,
+    name="splats", version=18, settings=SplatsSettings, needs=("bake", "train", "poses"), run=ByName("stages.splats.run:run"), uses_device=True,
 )  # fmt: skip

@@ -173,11 +173,11 @@ def test_an_asset_alone_is_fitted_to_its_own_renders(inputs: dict[str, Path]) ->
     ("pixels", "count", "steps"),
     [
         ([480 * 360] * 31, 480 * 360, 1080),
-        ([640_000] * 100, 300_000, 3600),
-        ([800 * 533] * 292, 300_000, 3600),
-        ([1008 * 756] * 40, 300_000, 1861),
+        ([640_000] * 100, 280_000, 3600),
+        ([800 * 533] * 292, 280_000, 3600),
+        ([1008 * 756] * 40, 280_000, 1861),
         ([40_000] * 100, 40_000, 3000),
-        ([], 300_000, 1080),
+        ([], 280_000, 1080),
     ],
 )
 def test_more_pixels_take_more_steps_and_bear_more_gaussians(pixels: list[int], count: int, steps: int) -> None:

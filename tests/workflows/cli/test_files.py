@@ -170,7 +170,7 @@ def test_every_frame_has_its_passes_where_asked_for(enerf: Enerf, ball: Path, tm
         (["--to", "ball.ply", "--splats", "--points"], 2, "one"),
         (["--to", "ball.glb", "--splats", "--texture", "asset"], 2, "texture"),
         (["--to", "ball.ply", "--splats", "--set", "splats.sh_degree=4"], 2, "splats.sh_degree"),
-        (["--to", "ball.ply", "--splats", "--memory", "100m"], 2, "Lower splats.count (300000)"),
+        (["--to", "ball.ply", "--splats", "--memory", "100m"], 2, "Lower splats.count (280000)"),
         (["--to", "no/where/ball.ply"], 2, "no/where"),
         (["--to", "cameras.json"], 2, "cameras"),
         (["--to", "ball.ply", "--memory", "100m"], 2, "--memory"),

@@ -7,7 +7,7 @@
     colours    3 times 8 bits: 0.5 + 0.15 f_dc
     scales     3 times 8 bits: their logarithms in sixteenths, from -10
     rotations  32 bits: which of x y z w is the largest, and 10 bits for each other one
-    harmonics  8 bits for each coefficient above f_dc, in 128ths from -1 to 1; rounded to multiples of BUCKETS, so that they compress
+    harmonics  8 bits for each coefficient above f_dc, in 128ths from -1 to 1; rounded to multiples of BUCKET, so that they compress
 
 Version 3 is all this as gzip. Version 4 is its header as it stands, a table of the streams' bytes as stored and as unpacked, and each part as a zstd frame.
 
@@ -39,7 +39,7 @@ BITS = 12  # fractional bits of places that other writers have; here there are a
 STEPS = 4  # of places, in the thickness of the thinnest Gaussians but a twentieth
 COLOUR = 0.15
 SCALE_STEPS, SMALLEST_SCALE = 16, -10
-BUCKETS = (2, 4)  # of 256: what harmonics of degree 1, and those above, are rounded to; Niantic's writer has 8 and 16. docs/experiments/splat-formats.md
+BUCKET = 4  # of 256: what harmonics are rounded to; Niantic's writer has 8 for degree 1 and 16 above. docs/experiments/splat-formats.md
 LEVEL, ZSTD_LEVEL = 6, 12  # of the compression; the latter is that of Niantic's writer
 HEADER = struct.Struct("<4sIIBBBBI12x")  # of version 4
 _GZIP = b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x02\xff"  # no time, no name, no system: the same Gaussians give the same bytes
@@ -60,11 +60,10 @@ def _quantised(gaussians: Gaussians, path: Path) -> tuple[int, list[bytes]]:
         raise BadInput(f"{path}: Gaussians at up to {reach:g} units; SPZ has places up to {LARGEST}. Write .ply or .glb.")
     thin = float(np.quantile(gaussians.scales.min(axis=1), 0.05))
     bits = min(max(BITS, math.ceil(math.log2(STEPS / thin))), math.floor(math.log2(LARGEST / max(reach, 2**-20))), 22)
-    count, harmonics = gaussians.harmonics.shape[:2]
+    count = len(gaussians)
     places = np.round(gaussians.means.astype(np.float64) * 2**bits).astype("<i4")
     above = gaussians.harmonics[:, 1:].astype(np.float64)
-    bucket = np.where(np.arange(1, harmonics) < 4, *BUCKETS)[:, None]
-    codes = (np.round(above * 128).astype(np.int64) + 128 + bucket // 2) // bucket * bucket
+    codes = (np.round(above * 128).astype(np.int64) + 128 + BUCKET // 2) // BUCKET * BUCKET
     return bits, [
         places.view(np.uint8).reshape(count, 3, 4)[:, :, :3].tobytes(),
         _bytes(gaussians.opacities * 255.0),
