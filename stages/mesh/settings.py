@@ -55,4 +55,4 @@ class MeshSettings:
         return int(str(self.max_faces).replace("k", "000"))
 
 
-STAGE = Stage(name="mesh", version=22, settings=MeshSettings, needs=("bake", "train", "poses"), run=ByName("stages.mesh.run:run"))
+STAGE = Stage(name="mesh", version=23, settings=MeshSettings, needs=("bake", "train", "poses"), run=ByName("stages.mesh.run:run"))

@@ -57,8 +57,7 @@ def refined(vertices: np.ndarray, faces: np.ndarray, photographs: Iterable[Photo
     cameras: list[Camera] = []
     grades, greys = [], []
     for photo in photographs:
-        while photo.usable.size > MAX_PIXELS:
-            photo = photo.halved()
+        photo = photo.reduced(MAX_PIXELS)
         cameras.append(photo.camera)
         grades.append(shown_vertices(vertices, faces, normals, photo, tick))
         greys.append(_grey(photo.colours))

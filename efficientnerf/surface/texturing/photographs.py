@@ -61,6 +61,10 @@ class Photograph:
         assert usable is not None
         return Photograph(camera, colours, usable)
 
+    def reduced(self, most: int) -> Photograph:
+        """Halved until it has no more than so many pixels."""
+        return self if self.usable.size <= most else self.halved().reduced(most)
+
 
 def photograph(camera: Camera, image: np.ndarray, mask: np.ndarray | None = None) -> Photograph:
     """A photograph as in files: uint8 (H, W, 3), or (H, W, 4) with straight alpha; mask (H, W) bool, True: use."""
@@ -102,14 +106,23 @@ def shown_vertices(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray,
     return out
 
 
-def _shown(seen: _Seen, photo: Photograph) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Numbers of the vertices that a photograph shows, not too obliquely and away from edges, and columns and rows of their pixels."""
+def colours_seen(
+    vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, photo: Photograph, tick: Callable[[], None] = _untold
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Numbers of the vertices that a photograph shows, also near edges, their colours (N, 3), 0-1, and how much these count: less near edges."""
+    seen = _seen(vertices, faces, normals, photo, tick)
+    at, column, row = _shown(seen, photo, least=1.0)
+    return at, photo.colours[row, column].astype(np.float64) / 255, np.minimum(seen.clear[row, column].astype(np.float64) / CLEAR, 1) ** 2 * seen.facing[at]
+
+
+def _shown(seen: _Seen, photo: Photograph, least: float = CLEAR) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Numbers of the vertices that a photograph shows, not too obliquely and `least` pixels away from edges, and columns and rows of their pixels."""
     at = np.flatnonzero(np.isfinite(seen.pixels).all(1) & (seen.depth > 0) & (seen.facing > FACING))
     column, row = np.floor(np.clip(seen.pixels[at], -1, 1e9)).astype(np.int64).T
     inside = (column >= 0) & (row >= 0) & (column < photo.camera.width) & (row < photo.camera.height)
     at, column, row = at[inside], column[inside], row[inside]
     slack = SLACK + _pixel_shift(photo) * np.sqrt(np.maximum(1 - seen.facing[at] ** 2, 0)) / seen.facing[at]
-    shown = (seen.depth[at] * seen.near[row, column] <= 1 + slack) & (seen.clear[row, column] >= CLEAR)
+    shown = (seen.depth[at] * seen.near[row, column] <= 1 + slack) & (seen.clear[row, column] >= least)
     return at[shown], column[shown], row[shown]
 
 
