@@ -34,8 +34,8 @@ class MeshSettings:
     )
     photometric_refinement: Literal["auto", "off"] = setting(
         "auto",
-        "Whether the surface is moved, by a few pixels, to where the training photographs agree on it, and contours to their edges; auto: where three, and two,"
-        " of them show that, unless cameras are poor or photographs agree no better afterwards.",
+        "Whether the surface is moved, by a few pixels, to where the training photographs agree on it, and its contours to their edges; auto: where three"
+        " photographs show it, contours where two do, unless cameras are poor or photographs agree no better afterwards.",
         advanced=True,
     )
     texture: Literal["auto", "photographs", "asset", "off"] = setting(

@@ -98,7 +98,7 @@ def _offsets(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, face_
     at = np.flatnonzero((np.abs(cosine) < GRAZING) & (depth > 0) & inside)
     size = depth[at] / camera.intrinsics["fx"]
     outward = project(camera, vertices[at] + 0.5 * size[:, None] * normals[at])[0] - pixels[at]
-    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+    outward = np.nan_to_num(outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9))  # nan beyond what the lens shows
     places = pixels[at, None] + ACROSS[:, None] * outward[:, None]  # (N, S, 2)
     image = mesh_image(vertices, faces, resized(camera, FINER * camera.width, FINER * camera.height))
     column, row = np.moveaxis((FINER * places).astype(np.int64), -1, 0)
