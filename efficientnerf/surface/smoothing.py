@@ -3,6 +3,7 @@
 V vertices, F faces (counter-clockwise seen from outside).
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -82,6 +83,24 @@ def smoothed_face_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, 
         smooth_face_normals(normals, area, neighbours, sharpness, other)
         normals, other = other, normals
     return normals
+
+
+def settled(
+    values: np.ndarray, sums: np.ndarray, weights: np.ndarray, edges: tuple[Any, np.ndarray], stiff: float, stay: float, sweeps: int,
+    tick: Callable[[], None] = lambda: None,
+) -> np.ndarray:  # fmt: skip
+    """(V,) values after sweeps of Jacobi's method towards what each vertex is asked for, its neighbours', and zero.
+
+    values        (V,) to begin with
+    sums, weights (V,) of what is asked for, times its weight, and the weights
+    edges         of `vertex_neighbours`
+    stiff, stay   weights of each neighbour's value, and of zero
+    """
+    neighbours, degree = edges
+    for _ in range(sweeps):
+        tick()
+        values = (sums + stiff * (neighbours @ values)) / (weights + stiff * degree[:, 0] + stay)
+    return values
 
 
 def vertex_neighbours(faces: np.ndarray, count: int) -> tuple[Any, np.ndarray]:

@@ -17,7 +17,7 @@ from efficientnerf.geometry.cameras import project, resized
 from efficientnerf.surface.fitting.photometric import MAX_PIXELS
 from efficientnerf.surface.mesh import vertex_normals
 from efficientnerf.surface.rasteriser import mesh_image
-from efficientnerf.surface.smoothing import vertex_neighbours
+from efficientnerf.surface.smoothing import settled, vertex_neighbours
 from efficientnerf.surface.texturing.photographs import Photograph, colours_seen
 
 # docs/experiments/surface.md
@@ -52,7 +52,7 @@ def fitted_to_contours(
     photographs  gives them one after the other, each time that it is called
     tick         is called before each; what it raises stops the work
     """
-    neighbours, degree = vertex_neighbours(faces, len(vertices))
+    edges = vertex_neighbours(faces, len(vertices))
     face_colours = _photographed(vertices, faces, colours, photographs(), tick)[faces].mean(axis=1)
     fitted, distances = vertices, []
     for number in range(ROUNDS + 1):
@@ -68,9 +68,7 @@ def fitted_to_contours(
         if number == ROUNDS or not apart[1] > 0:
             break
         sums[(witnesses < WITNESSES) | (sums[:, 1] < LEAST_WEIGHT)] = 0
-        move = np.zeros(len(vertices))
-        for _ in range(SWEEPS):
-            move = (sums[:, 0] + STIFF * (neighbours @ move)) / (sums[:, 1] + STIFF * degree[:, 0] + STAY)
+        move = settled(np.zeros(len(vertices)), sums[:, 0], sums[:, 1], edges, STIFF, STAY, SWEEPS, tick)
         fitted = fitted + move[:, None] * normals
     improved = distances[-1] < distances[0]
     return ContourFit(fitted if improved else vertices, distances[0], distances[-1], improved)

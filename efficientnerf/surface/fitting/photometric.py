@@ -19,7 +19,7 @@ from efficientnerf.backends.numba.mesh.photometric import agreement, choose
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera, project
 from efficientnerf.surface.mesh import vertex_normals
-from efficientnerf.surface.smoothing import vertex_neighbours
+from efficientnerf.surface.smoothing import settled, vertex_neighbours
 from efficientnerf.surface.texturing.photographs import Photograph, shown_vertices
 
 # docs/experiments/surface.md
@@ -98,7 +98,7 @@ class _Search:
         self.starts = np.cumsum([0, *(grey.size for grey in self.greys[:-1])]).astype(np.int64)
         self.shapes = np.array([grey.shape for grey in self.greys], np.int64)
         self.pixels = np.concatenate([grey.ravel() for grey in self.greys])
-        self.neighbours, self.degree = vertex_neighbours(self.faces, len(self.chosen))
+        self.edges = vertex_neighbours(self.faces, len(self.chosen))
 
     def agreement(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(V,) how well the photographs agree on vertices as they are, and what that counts."""
@@ -168,11 +168,9 @@ class _Search:
     def _smoothed(self, best: np.ndarray, confidence: np.ndarray) -> np.ndarray:
         """(V,) offsets, in steps, near the best where that can be trusted and near those of the neighbours elsewhere; what these contradict counts less
         (Geman-McClure)."""
-        out, stiff, own = np.zeros(len(best)), STIFF * self.degree[:, 0], confidence
+        out, own = np.zeros(len(best)), confidence
         for _ in range(REWEIGHTED + 1):
-            for _ in range(SWEEPS):
-                self.tick()
-                out = (own * best + STIFF * (self.neighbours @ out)) / (own + stiff + STAY)
+            out = settled(out, own * best, own, self.edges, STIFF, STAY, SWEEPS, self.tick)
             own = confidence / (1 + (best - out) ** 2) ** 2
         return out
 

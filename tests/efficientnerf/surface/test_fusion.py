@@ -208,7 +208,7 @@ def test_a_noisy_ball_is_smooth_and_where_it_is() -> None:
     (angle, away), (angle_before, away_before) = errors(views), errors([])
     assert angle < 0.5 * angle_before
     assert angle < 6
-    assert away < min(0.6, 0.6 * away_before)
+    assert away < min(0.55, 0.6 * away_before)
 
 
 def test_a_region_cuts_cleanly() -> None:
@@ -287,4 +287,4 @@ def test_a_noisy_wall_before_a_reference_camera_is_smooth() -> None:
 
     found, before = angle(views), angle([])
     assert found < 0.5 * before
-    assert found < 10
+    assert found < 9.1
