@@ -29,6 +29,7 @@ from efficientnerf.training.exposure.model import Exposure, is_learned
 from efficientnerf.training.occupancy_update import update_in_turn
 from efficientnerf.training.optimiser import Adam, ParameterGroup, parameter_groups
 from efficientnerf.training.pixels import Pixels
+from efficientnerf.training.plain_regions import plain_discs, plain_weight
 from efficientnerf.training.readback import AsyncReadback, StepCounts, counts_of
 from efficientnerf.training.schedule import Schedule, schedule_of
 from efficientnerf.training.sparse_depth import SparseDepthRays, sparse_depth_weight
@@ -126,6 +127,7 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
     if t.checks is not None and t.checks.changed:
         follow_checks(t.checks, pixels)
     source = DevicePixels(pixels, m.device) if m.device.type == "cuda" else pixels
+    plain = plain_discs(pixels) if m.space.contracted and settings.plain_loss_weight > 0 else None
     learner, graphs = Learner(m, t.adam, source, t.exposure), StepGraphs(m.device, t.adam.parameters)
     samples_per_pivot = 0
     while t.step < t.schedule.iterations:
@@ -137,11 +139,12 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
             readback.restart()  # rays will have other numbers of samples from now on
 
         weight = sparse_depth_weight(settings.sparse_depth_loss_weight, fraction) if m.space.unbounded else 0.0
-        numbers = StepNumbers(t.adam.step_size(number, t.schedule.learning_rate_at(number)), m.distortion_weight(fraction), weight)
+        rate = t.schedule.learning_rate_at(number)
+        numbers = StepNumbers(t.adam.step_size(number, rate), m.distortion_weight(fraction), weight, plain_weight(settings.plain_loss_weight, fraction))
         count = ray_count(settings, t.samples_per_ray)
         with graphs.ordered():
             count = count if readback is None else graphs.rays(count)
-            inputs = drawn_step(learner, sparse_depth if weight > 0 else None, count, rng, crop=number <= settings.precrop_steps)
+            inputs = drawn_step(learner, sparse_depth if weight > 0 else None, plain, count, rng, crop=number <= settings.precrop_steps)
             aimed = 0 if inputs.aimed is None else len(inputs.aimed.distance)
             rays = len(inputs.rays.pixel) + aimed
             # Aimed rays begin closer to the camera, and end farther away.

@@ -166,6 +166,14 @@ class Pixels:
         """(R,) bool: whether these pixels are usable."""
         return _set_at(self.usable, index)
 
+    def usable_of(self, view: int) -> np.ndarray:
+        """(H, W) bool: the usable pixels of a view."""
+        begin, end, size = int(self.offsets[view]), int(self.offsets[view + 1]), (self.height[view], self.width[view])
+        if self.usable is None:
+            return np.ones(size, bool)
+        bits = np.unpackbits(self.usable[begin // 8 : -(-end // 8)])
+        return bits[begin % 8 :][: end - begin].view(bool).reshape(size)
+
     def allowed_at(self, index: np.ndarray) -> np.ndarray:
         """(R,) bool: whether masks allow these pixels, those of views that are left out, too."""
         return _set_at(self.allowed, index)

@@ -94,6 +94,9 @@ class TrainSettings:
         " steps.",
         advanced=True,
     )
+    plain_loss_weight: NonNegative = setting(
+        0.01, "Weight of the loss that makes plain regions of photographs flat and opaque between what is, in contracted scenes.", advanced=True
+    )
     exposure: Literal["auto", "off", "on"] = setting(
         "auto",
         "Whether unbounded scenes learn the exposure and white balance of each photograph, and the vignetting and response of each camera; auto: where"

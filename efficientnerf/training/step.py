@@ -15,6 +15,7 @@ from efficientnerf.training.losses import colour_losses, mean_over, scale_gradie
 from efficientnerf.training.occupancy_update import update_on_rays
 from efficientnerf.training.optimiser import Adam, StepSize
 from efficientnerf.training.pixels import Pixels
+from efficientnerf.training.plain_regions import RAYS_PER_TRIPLE, PlainDiscs, PlainTriples, drawn_triples, plain_loss
 from efficientnerf.training.settings import TrainSettings
 from efficientnerf.training.sparse_depth import RAYS_PER_RAY, AimedRays, SparseDepthRays, aimed_rays, sparse_depth_loss
 
@@ -36,6 +37,7 @@ class StepInputs(NamedTuple):
     rays: DrawnRays
     place: Any = None  # photograph (R,) and r^2 (R,) of each ray, `efficientnerf.training.exposure.model.places`, where exposures are known
     aimed: AimedRays | None = None
+    plain: PlainTriples | None = None
     explored: Tensor | None = None  # see `efficientnerf.sampling.strategies.SamplingRequest`
 
 
@@ -46,6 +48,7 @@ class StepNumbers(NamedTuple):
     # weights of losses
     distortion: Any
     sparse_depth: Any
+    plain: Any
 
 
 class StepPlan(NamedTuple):
@@ -74,24 +77,31 @@ def ray_count(settings: TrainSettings, samples_per_ray: float) -> int:
     return int(min(settings.max_rays_per_batch, max(MIN_RAYS, settings.sample_batch_size / samples_per_ray)))
 
 
-def drawn_rays(m: Model, pixels: Pixels | DevicePixels, count: int, rng: np.random.Generator, *, crop: bool) -> DrawnRays:
-    """`count` random pixels; with `crop`, of the middle of the images."""
-    host, behind = on_host(pixels), None
+def drawn_rays(
+    m: Model, pixels: Pixels | DevicePixels, count: int, rng: np.random.Generator, *, crop: bool, plain: PlainDiscs | None = None
+) -> tuple[DrawnRays, PlainTriples | None]:
+    """`count` random pixels, with `crop` of the middle of the images; the first of them are triples of plain regions, where there are some."""
+    host, behind, triples = on_host(pixels), None, None
     pixel, offset = host.choose(count, rng, middle=crop), rng.random(count, np.float32)
+    if plain is not None:
+        first, triples = drawn_triples(plain, host, count // RAYS_PER_TRIPLE, rng)
+        pixel = np.concatenate([first, pixel[len(first) :]])
     if m.space.reaches_infinity and m.background is None:
         # Behind a space that reaches to infinity nothing lies: a random colour for each ray keeps the field from staying half transparent.
         behind = rng.random((count, 3), np.float32)
     if host.images.shape[1] == 4 and (m.settings.background_color == "random" or m.background is None):
         # Behind an object with alpha anything may lie: a random colour for each ray keeps the field from learning one.
         behind = rng.random((count, 3), np.float32)
-    return DrawnRays(pixel, offset, behind, pixels.colours_to_send(pixel) if isinstance(pixels, DevicePixels) else None)
+    return DrawnRays(pixel, offset, behind, pixels.colours_to_send(pixel) if isinstance(pixels, DevicePixels) else None), triples
 
 
-def drawn_step(learner: Learner, sparse_depth: SparseDepthRays | None, count: int, rng: np.random.Generator, *, crop: bool) -> StepInputs:
-    """Rays through `count` pixels, with `crop` of the middle of the images, and rays to sparse points, where there are some."""
-    rays = drawn_rays(learner.model, learner.pixels, count, rng, crop=crop)
+def drawn_step(
+    learner: Learner, sparse_depth: SparseDepthRays | None, plain: PlainDiscs | None, count: int, rng: np.random.Generator, *, crop: bool
+) -> StepInputs:
+    """Rays through `count` pixels, as `drawn_rays`, and rays to sparse points, where there are some."""
+    rays, triples = drawn_rays(learner.model, learner.pixels, count, rng, crop=crop, plain=plain)
     aimed = None if sparse_depth is None else aimed_rays(sparse_depth, max(1, count // RAYS_PER_RAY), rng)
-    return StepInputs(rays, None if learner.exposure is None else places(on_host(learner.pixels), rays.pixel), aimed)
+    return StepInputs(rays, None if learner.exposure is None else places(on_host(learner.pixels), rays.pixel), aimed, triples)
 
 
 def build_rays(m: Model, pixels: Pixels | DevicePixels, drawn: DrawnRays) -> tuple[tuple[Tensor, ...], Tensor]:
@@ -130,6 +140,8 @@ def step_on_rays(learner: Learner, plan: StepPlan, inputs: StepInputs, numbers: 
         loss = loss + numbers.distortion * mean_over(outputs.distortion[:count], complete)
     if m.space.contracted:
         scale_gradients_by_distance(m, origins, outputs)
+    if inputs.plain is not None:
+        loss = loss + numbers.plain * plain_loss(m, outputs, origins, bundle[1], inputs.plain, complete)
     if aimed is not None:
         loss = loss + numbers.sparse_depth * sparse_depth_loss(outputs, aimed.distance, aimed.on_support, plan.samples_per_pivot, fitting)
     loss.backward()

@@ -21,7 +21,7 @@ from efficientnerf.training.optimiser import StepSize
 from efficientnerf.training.step import StepInputs, StepNumbers
 
 KEPT = 8  # graphs
-NUMBERS = 5  # of StepNumbers
+NUMBERS = 6  # of StepNumbers
 HELD = 0.06  # share by which the number of rays may be off from the wanted one
 Body = Callable[[StepInputs, StepNumbers], Tensor]
 
@@ -142,10 +142,10 @@ def _copy(places: Any, values: Any) -> None:
 
 
 def _numbers(values: Tensor) -> StepNumbers:
-    """Views of what `_fill` fills (5,)."""
-    rate, correction1, correction2, distortion, sparse_depth = values.unbind()
-    return StepNumbers(StepSize(rate, correction1, correction2), distortion, sparse_depth)
+    """Views of what `_fill` fills (6,)."""
+    rate, correction1, correction2, *weights = values.unbind()
+    return StepNumbers(StepSize(rate, correction1, correction2), *weights)
 
 
 def _fill(place: Tensor, numbers: StepNumbers) -> None:
-    _copy(place, np.array([*numbers.size, numbers.distortion, numbers.sparse_depth], np.float32))
+    _copy(place, np.array([*numbers.size, *numbers[1:]], np.float32))

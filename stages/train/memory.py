@@ -7,6 +7,7 @@ from efficientnerf.fields.hash import FEATURES, grids, level_sizes
 from efficientnerf.geometry.spaces import Space
 from efficientnerf.settings import resolved
 from efficientnerf.training.pixels import EXACT, LISTED_SHARE, STRIDE, PixelRows
+from efficientnerf.training.plain_regions import LONGEST, MOST_DISCS
 from efficientnerf.training.settings import TrainSettings
 from pipeline.executors.memory import size_text
 from pipeline.stage import Job
@@ -23,6 +24,7 @@ PIXELS = "training pixels"
 # Bytes. A direction of each pixel of a lens while the table of directions is built, in float64; a density voxel, with what an update of some of them takes;
 # sparse points, over those of their file, and an observation of one that is used: its rays and what they are made of.
 DIRECTION, DENSITY_VOXEL = 220, 26
+PLAIN, DISC, PHOTOGRAPH = 64, 24, 10  # a pixel of the picture that plain regions are looked for in, a disc of one, and a pixel of the photograph
 TABLES, SAVED = 4, 6  # of float32 for each parameter: itself, its gradient, Adam's moments; and while a checkpoint is written, three of these twice
 POINTS, OBSERVATION = 4, 250
 # Bytes written. Of a parameter in the field's file, and in a checkpoint, with Adam's moments; of a density voxel in either; of a training pixel. Checkpoints
@@ -80,10 +82,12 @@ def needed(settings: TrainSettings, views: Sequence[View], channels: int, space:
     """
     pixels = pixels_needed(views, channels)
     reading = pixels["reading images"] + pixels["directions of pixels"]
+    largest = max(view.camera.width * view.camera.height for view in views)
+    plain = PLAIN * min(largest, LONGEST**2) + PHOTOGRAPH * largest + DISC * MOST_DISCS
     intervals = space.max_intervals(space.sampled_length(None) / (resolved(settings.num_coarse_samples) or space.num_coarse_samples))
     return Need({
         PIXELS: pixels[PIXELS],
-        "a step's samples, or reading images": max(step_bytes(settings, intervals), reading),
+        "a step's samples, or reading images": max(step_bytes(settings, intervals), reading, plain),
         "parameters and checkpoints": 4 * (TABLES + SAVED) * parameters(settings),
         "density voxels": DENSITY_VOXEL * (resolved(settings.occupancy_resolution) or space.occupancy_resolution) ** 3,
         "sparse points": POINTS * points + OBSERVATION * min(MOST_OBSERVATIONS, points // 8),
