@@ -1,14 +1,17 @@
 """The surface of an unbounded scene: that of each cascade in its own grid, joined.
 
-A cascade's surface is cut where the one before begins and where its own box ends, and open there. The parts are not sewn together: between cascades, whose
-voxels differ by a factor of two, there may be cracks of about a voxel.
+A cascade's surface is cut where the one before begins and where its own box ends, and open there. Voxels of two cascades differ by a factor of two, so that
+the parts do not meet: flaps of both cover the crack.
 
-F faces.
+V vertices, F faces.
 """
 
+import itertools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from efficientnerf.asset.cascades import cascade_sides, cascade_tree, cascades_of, point_cascades, voxel_cascades
 from efficientnerf.asset.tree import Cascade, NerfTree, Region
@@ -24,6 +27,8 @@ MIN_FACES = 20
 SKIPPED = 2  # of the views whose depths are fused, one in this many has its silhouette fitted
 BORDER = 0.6  # voxels of a cascade from the borders of its box, and of the one before, in which its surface has lids
 ALONG = 0.7  # cosine of a lid's normal to that of the border
+# Voxels of the coarser cascade: how far from the border of the two, and from each other, open edges face each other; how far a flap goes on; between samples.
+FACING, OVERLAP, SPACING = 2.0, 0.5, 0.25
 
 
 def scene_surface(
@@ -61,10 +66,17 @@ def scene_surface(
             mesh = surface_of(number, cascade_tree(tree, number), share)
         except NoSurface:
             continue
-        found.append((mesh, _visible(tree, number, mesh.vertices, mesh.faces)))
-    if not any(kept.any() for _, kept in found):
+        kept = _visible(tree, number, mesh.vertices, mesh.faces)
+        if kept.any():
+            found.append(_part(mesh, kept, number))
+    if not found:
         raise NoSurface("the density of no cascade reaches the threshold" + ("" if threshold is None else f" {threshold:.4g}"))
-    return _joined([(mesh, kept) for mesh, kept in found if kept.any()])
+    cascades = cascades_of(tree)
+    for n, (fine, coarse) in enumerate(itertools.pairwise(list(found))):
+        if coarse.number == fine.number + 1:
+            seam = cascades[fine.number], tree.brick, cascades[coarse.number].voxel
+            found[n : n + 2] = _with_flaps(found[n], coarse, *seam), _with_flaps(coarse, fine, *seam)
+    return _joined(found)
 
 
 def face_sizes(tree: NerfTree, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -120,19 +132,73 @@ def _lids(cascade: Cascade, brick: int, at: np.ndarray, normal: np.ndarray, voxe
     return np.asarray(np.linalg.norm(np.where(near, outward, 0), axis=1) > ALONG)
 
 
-def _joined(parts: list[tuple[Mesh, np.ndarray]]) -> Mesh:
-    """One mesh of the chosen faces (F,) of several; the facts are those of the first, with the numbers of faces and components summed."""
-    vertices, faces, normals, colours, first = [], [], [], [], 0
-    for mesh, kept in parts:
-        used, index = np.unique(mesh.faces[kept], return_inverse=True)
-        vertices.append(mesh.vertices[used])
-        normals.append(mesh.normals[used])
-        colours.append(mesh.colours[used])
-        faces.append(index.reshape(-1, 3) + first)
-        first += len(used)
-    facts: dict[str, object] = dict(parts[0][0].facts) | {"cascades": len(parts)}
+class _Part(NamedTuple):
+    """What is seen of a cascade's surface."""
+
+    number: int  # of the cascade
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    colours: np.ndarray
+    facts: dict[str, object]
+
+
+def _part(mesh: Mesh, kept: np.ndarray, number: int) -> _Part:
+    used, index = np.unique(mesh.faces[kept], return_inverse=True)
+    return _Part(number, mesh.vertices[used], index.reshape(-1, 3), mesh.normals[used], mesh.colours[used], mesh.facts)
+
+
+def _open_edges(part: _Part, border: Cascade, brick: int, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """(E, 2) edges that one face has, in its order, and the face's third corner (E,), within reach of the border of a box."""
+    edges, third = part.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), part.faces[:, [2, 0, 1]].ravel()
+    key = edges @ [len(part.vertices), 1]
+    near = (np.abs(_depth(border, brick, part.vertices).min(axis=1)) < reach)[edges].all(axis=1)
+    alone = near & ~np.isin(key, edges[:, ::-1] @ [len(part.vertices), 1])
+    return edges[alone], third[alone]
+
+
+def _with_flaps(part: _Part, other: _Part, border: Cascade, brick: int, voxel: float) -> _Part:
+    """A part with a flap from each open edge to the open edges of the other part that it faces, and a little farther."""
+    edges, third = _open_edges(part, border, brick, FACING * voxel)
+    others, _ = _open_edges(other, border, brick, FACING * voxel)
+    if not len(edges) or not len(others):
+        return part
+    ends = other.vertices[others]
+    count = max(2, int(np.ceil(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max() / (SPACING * voxel))) + 1)
+    samples = (ends[:, :1] + np.linspace(0, 1, count)[None, :, None] * (ends[:, 1:] - ends[:, :1])).reshape(-1, 3)
+    along = part.vertices[edges[:, 1]] - part.vertices[edges[:, 0]]
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
+    inward = part.vertices[third] - part.vertices[edges[:, 0]]
+    inward -= (inward * along).sum(axis=1, keepdims=True) * along
+    outward = np.zeros_like(part.vertices)
+    np.add.at(outward, edges.ravel(), np.repeat(-inward / np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-300), 2, axis=0))
+    rim = np.unique(edges)
+    distance, nearest = cKDTree(samples).query(part.vertices[rim])
+    facing = np.zeros(len(part.vertices), bool)
+    facing[rim] = distance < FACING * voxel
+    edges = edges[facing[edges].all(axis=1)]
+    rim, nearest = rim[facing[rim]], nearest[facing[rim]]
+    if not len(edges):
+        return part
+    direction = outward[rim] / np.maximum(np.linalg.norm(outward[rim], axis=1, keepdims=True), 1e-300)
+    beyond = np.zeros(len(part.vertices), np.int64)
+    beyond[rim] = len(part.vertices) + np.arange(len(rim))
+    (u, v), (u2, v2) = edges.T, beyond[edges].T
+    flaps = np.concatenate([np.stack([v, u, u2], axis=1), np.stack([v, u2, v2], axis=1)])
+    vertices = np.concatenate([part.vertices, samples[nearest] + OVERLAP * voxel * direction])
+    used, index = np.unique(np.concatenate([part.faces, flaps]), return_inverse=True)
+    normals, colours = (np.concatenate([each, each[rim]])[used] for each in (part.normals, part.colours))
+    return part._replace(vertices=vertices[used], faces=index.reshape(-1, 3), normals=normals, colours=colours)
+
+
+def _joined(parts: list[_Part]) -> Mesh:
+    """One mesh of several parts; the facts are those of the first, with the numbers of faces and components summed."""
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = [part.faces + begin for part, begin in zip(parts, first[:-1].tolist(), strict=True)]
+    facts: dict[str, object] = dict(parts[0].facts) | {"cascades": len(parts)}
     for name, value in facts.items():
-        others = [mesh.facts.get(name) for mesh, _ in parts]
+        others = [part.facts.get(name) for part in parts]
         if name != "cascades" and all(type(other) is int for other in [value, *others]):
             facts[name] = sum(other for other in others if isinstance(other, int))
-    return Mesh(np.concatenate(vertices), np.concatenate(faces).astype(np.int64), np.concatenate(normals), np.concatenate(colours), facts)
+    vertices, normals, colours = (np.concatenate([getattr(part, name) for part in parts]) for name in ("vertices", "normals", "colours"))
+    return Mesh(vertices, np.concatenate(faces).astype(np.int64), normals, colours, facts)

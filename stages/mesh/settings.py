@@ -15,7 +15,7 @@ class MeshSettings:
 
     region: Literal["foreground", "all"] = setting(
         "foreground",
-        "What is meshed: the subject and what it stands on, clipped at the edge (foreground), or the whole scene (all), with cracks where its grids meet.",
+        "What is meshed: the subject and what it stands on, clipped at the edge (foreground), or the whole scene (all).",
         advanced=True,
     )
     max_faces: Annotated[int, Meta(ge=100, le=10**8)] | Literal["20k", "100k", "500k"] = setting(
@@ -55,4 +55,4 @@ class MeshSettings:
         return int(str(self.max_faces).replace("k", "000"))
 
 
-STAGE = Stage(name="mesh", version=23, settings=MeshSettings, needs=("bake", "train", "poses"), run=ByName("stages.mesh.run:run"))
+STAGE = Stage(name="mesh", version=24, settings=MeshSettings, needs=("bake", "train", "poses"), run=ByName("stages.mesh.run:run"))
