@@ -16,7 +16,7 @@ from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.plain_regions import PlainTriples, drawn_triples, plain_discs, plain_loss, plain_weight
 from tests.efficientnerf.balls import BOUNDS, cameras, pose, untrained
 
-WIDTH, HEIGHT = 96, 64
+WIDTH, HEIGHT, BEGIN = 96, 64, 24
 
 
 def _camera() -> Camera:
@@ -27,52 +27,52 @@ def _pixels(image: np.ndarray, mask: np.ndarray | None = None) -> Pixels:
     return Pixels([_camera()], [image], [mask], np.full(1, 1.0), np.full(1, 5.0))
 
 
-def _half_plain() -> np.ndarray:
+def _plain_from(column: int) -> np.ndarray:
     """Noise on the left, a slow slope of colour on the right."""
     image = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
-    image[:, WIDTH // 2 :] = (120 + np.arange(WIDTH // 2) // 2)[None, :, None]
+    image[:, column:] = (120 + np.arange(WIDTH - column) // 2)[None, :, None]
     return image
 
 
 def test_discs_and_their_triples_lie_in_what_is_plain() -> None:
-    pixels = _pixels(_half_plain())
+    pixels = _pixels(_plain_from(BEGIN))
     discs = plain_discs(pixels)
     assert discs is not None
     assert len(discs.pixel) > 500
     y, x = np.divmod(discs.pixel, WIDTH)
-    clear = np.minimum.reduce([x - WIDTH // 2, WIDTH - x, y + 1, HEIGHT - y])
+    clear = np.minimum.reduce([x - BEGIN, WIDTH - x, y + 1, HEIGHT - y])
     assert (discs.radius <= clear).all()
     assert discs.radius.max() == pytest.approx(plain_regions.MOST_RADIUS * WIDTH)
     pixel, triples = drawn_triples(discs, pixels, 400, np.random.default_rng(1))
     assert triples.forward.shape == (1200, 3)
     (ay, by, cy), (ax, bx, cx) = (part.reshape(3, -1) for part in np.divmod(pixel, WIDTH))
     assert ((ax + cx == 2 * bx) & (ay + cy == 2 * by) & (np.hypot(ax - bx, ay - by) > 1)).all()
-    assert np.minimum(ax, cx).min() >= WIDTH // 2
+    assert np.minimum(ax, cx).min() >= BEGIN
 
 
-def test_there_are_none_in_noise_in_masks_and_behind_alpha() -> None:
-    image = _half_plain()
+def test_there_are_none_where_little_is_plain_in_masks_and_behind_alpha() -> None:
+    image = _plain_from(BEGIN)
     masked = np.ones((HEIGHT, WIDTH), bool)
     masked[:, WIDTH // 2 :] = False
-    assert plain_discs(_pixels(np.ascontiguousarray(image[:, ::-1][:, WIDTH // 2 :].repeat(2, 1)), ~masked[:, ::-1])) is None
+    assert plain_discs(_pixels(_plain_from(WIDTH // 2))) is None
     assert plain_discs(_pixels(image, masked)) is None
     assert plain_discs(_pixels(np.concatenate([image, np.full((HEIGHT, WIDTH, 1), 255, np.uint8)], axis=2))) is None
 
 
 def test_a_large_capture_keeps_a_share_of_its_discs(monkeypatch: pytest.MonkeyPatch) -> None:
-    every = plain_discs(_pixels(_half_plain()))
+    every = plain_discs(_pixels(_plain_from(BEGIN)))
     assert every is not None
     monkeypatch.setattr(plain_regions, "MOST_DISCS", len(every.pixel) // 4)
-    some = plain_discs(_pixels(_half_plain()))
+    some = plain_discs(_pixels(_plain_from(BEGIN)))
     assert some is not None
     assert np.isin(some.pixel, every.pixel).all()
     assert len(some.pixel) == pytest.approx(len(every.pixel) / 4, rel=0.1)
 
 
 def test_discs_of_a_large_photograph_are_looked_for_in_a_small_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = plain_discs(_pixels(_half_plain()))
+    whole = plain_discs(_pixels(_plain_from(BEGIN)))
     monkeypatch.setattr(plain_regions, "LONGEST", WIDTH // 3)
-    small = plain_discs(_pixels(_half_plain()))
+    small = plain_discs(_pixels(_plain_from(BEGIN)))
     assert whole is not None
     assert small is not None
     at = dict(zip(whole.pixel.tolist(), whole.radius.tolist(), strict=True))
