@@ -27,7 +27,6 @@ from efficientnerf.training.pixels import Pixels
 RAYS_PER_TRIPLE = 16
 BLUR, EDGE = 1.0, 2.5  # pixels; of 255 a pixel, the slope of a blurred channel that is an edge
 LEAST_RADIUS, MOST_RADIUS = 4.0, 0.1  # of discs: pixels; of the picture's longer side
-LEAST_SHARE = 0.4  # of the pixels that are centres of discs: with fewer the loss costs more than it gives
 MOST_DISCS, LONGEST = 2**20, 1280  # in all; longer side, in pixels, of the pictures that they are looked for in
 OPAQUE = 0.9  # opacity of both ends from which the middle is taken to be opaque too
 FARTHEST = 2.0  # distance of ends at most, over that of the farthest corner of the box: beyond it a plain region may be sky
@@ -56,20 +55,15 @@ def plain_weight(weight: float, fraction: float) -> float:
 
 
 def plain_discs(pixels: Pixels) -> PlainDiscs | None:
-    """Discs of the usable pixels, about MOST_DISCS at most, as many of each view; None: less than LEAST_SHARE of the pixels are plain, or images have alpha."""
+    """Discs of the usable pixels, about MOST_DISCS at most, as many of each view; None: there are none, or the images have alpha."""
     if pixels.images.shape[1] != 3:
         return None
-    each = MOST_DISCS // len(pixels.width) + 1
-    found, count = [], 0
-    for centres, radii, pixels_each in _discs_of_views(pixels):
-        count += len(centres) * pixels_each
-        every = -(-len(centres) // each) or 1
-        found.append((centres[::every], radii[::every]))
-    return PlainDiscs(*map(np.concatenate, zip(*found, strict=True))) if count >= LEAST_SHARE * len(pixels) else None
+    found = list(_discs_of_views(pixels))
+    return PlainDiscs(*map(np.concatenate, zip(*found, strict=True))) if any(len(centres) for centres, _ in found) else None
 
 
-def _discs_of_views(pixels: Pixels) -> Iterator[tuple[np.ndarray, np.ndarray, int]]:
-    """Centres and radii of each view's discs, and the pixels that a centre stands for: a large picture is searched at 1 / n of its size."""
+def _discs_of_views(pixels: Pixels) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Centres and radii of each view's discs; a large picture is searched at 1 / n of its size."""
     for view, (begin, width, height) in enumerate(zip(pixels.offsets[:-1].tolist(), pixels.width.tolist(), pixels.height.tolist(), strict=True)):
         n = -(-max(width, height) // LONGEST)
         rows, columns = height // n, width // n
@@ -80,7 +74,9 @@ def _discs_of_views(pixels: Pixels) -> Iterator[tuple[np.ndarray, np.ndarray, in
         plain = usable & (np.hypot(across, down).max(axis=2) < EDGE)
         clear = cv2.distanceTransform(np.pad(plain.astype(np.uint8), 1), cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1] - 1  # the frame is an edge
         y, x = np.nonzero(n * clear >= LEAST_RADIUS)
-        yield begin + (n * y + n // 2) * width + n * x + n // 2, np.minimum(n * clear[y, x], np.float32(MOST_RADIUS * max(width, height))), n * n
+        every = -(-len(y) // (MOST_DISCS // len(pixels.width) + 1)) or 1
+        y, x = y[::every], x[::every]
+        yield begin + (n * y + n // 2) * width + n * x + n // 2, np.minimum(n * clear[y, x], np.float32(MOST_RADIUS * max(width, height)))
 
 
 def drawn_triples(discs: PlainDiscs, pixels: Pixels, count: int, rng: np.random.Generator) -> tuple[np.ndarray, PlainTriples]:

@@ -83,7 +83,7 @@ def needed(settings: TrainSettings, views: Sequence[View], channels: int, space:
     pixels = pixels_needed(views, channels)
     reading = pixels["reading images"] + pixels["directions of pixels"]
     largest = max(view.camera.width * view.camera.height for view in views)
-    plain = PLAIN * min(largest, LONGEST**2) + PHOTOGRAPH * largest + DISC * MOST_DISCS
+    plain = PLAIN * min(largest, LONGEST**2) + PHOTOGRAPH * largest + DISC * MOST_DISCS if settings.plain_loss_weight else 0
     intervals = space.max_intervals(space.sampled_length(None) / (resolved(settings.num_coarse_samples) or space.num_coarse_samples))
     return Need({
         PIXELS: pixels[PIXELS],

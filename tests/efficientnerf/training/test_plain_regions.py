@@ -50,11 +50,11 @@ def test_discs_and_their_triples_lie_in_what_is_plain() -> None:
     assert np.minimum(ax, cx).min() >= BEGIN
 
 
-def test_there_are_none_where_little_is_plain_in_masks_and_behind_alpha() -> None:
+def test_there_are_none_in_noise_in_masks_and_behind_alpha() -> None:
     image = _plain_from(BEGIN)
     masked = np.ones((HEIGHT, WIDTH), bool)
-    masked[:, WIDTH // 2 :] = False
-    assert plain_discs(_pixels(_plain_from(WIDTH // 2))) is None
+    masked[:, BEGIN:] = False
+    assert plain_discs(_pixels(_plain_from(WIDTH))) is None
     assert plain_discs(_pixels(image, masked)) is None
     assert plain_discs(_pixels(np.concatenate([image, np.full((HEIGHT, WIDTH, 1), 255, np.uint8)], axis=2))) is None
 
@@ -176,7 +176,7 @@ def test_the_weight_rises_and_stays() -> None:
     assert weights == pytest.approx([0, 0.005, 0.01, 0.01])
 
 
-def test_unbounded_scenes_are_trained_with_it_and_objects_are_not() -> None:
+def test_unbounded_scenes_are_trained_with_it_where_asked_and_objects_are_not() -> None:
     made = cameras(4, 48)
     plain = [np.full((48, 48, 3), 60 + 30 * n, np.uint8) for n in range(4)]
 
