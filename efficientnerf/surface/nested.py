@@ -163,9 +163,11 @@ def _with_flaps(part: _Part, other: _Part, border: Cascade, brick: int, voxel: f
     others, _ = _open_edges(other, border, brick, FACING * voxel)
     if not len(edges) or not len(others):
         return part
-    ends = other.vertices[others]
-    count = max(2, int(np.ceil(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max() / (SPACING * voxel))) + 1)
-    samples = (ends[:, :1] + np.linspace(0, 1, count)[None, :, None] * (ends[:, 1:] - ends[:, :1])).reshape(-1, 3)
+    begin, whole = other.vertices[others[:, 0]], np.diff(other.vertices[others], axis=1)[:, 0]
+    pieces = 1 + (np.linalg.norm(whole, axis=1) / (SPACING * voxel)).astype(np.int64)
+    piece = np.repeat(np.arange(len(others)), pieces)
+    share = (np.arange(len(piece)) - (np.cumsum(pieces) - pieces)[piece] + 0.5) / pieces[piece]
+    samples = begin[piece] + share[:, None] * whole[piece]
     along = part.vertices[edges[:, 1]] - part.vertices[edges[:, 0]]
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
     inward = part.vertices[third] - part.vertices[edges[:, 0]]
