@@ -56,6 +56,8 @@ def trained(job: Job) -> bool:
     m = model(space, replace(settings, exposure="off" if exposure is None else "on"), s.background, job.device, (near, far))
     if begin_sky(m, pixels):
         job.say("the photographs have one plain colour along their borders: the sky begins with it")
+    if settings.plain_loss_weight > 0 and not (space.contracted and pixels.images.shape[1] == 3):
+        job.say("train.plain_loss_weight has no effect: it is for contracted scenes of photographs without alpha")
     priors = mask_uncovered_cells(m, views, job)
 
     t = loop.trainer(m, exposure, cameras=[view.camera for view in views])

@@ -48,6 +48,14 @@ def checkpoints(made: Job) -> list[str]:
     return sorted(path.name for path in made.work.glob("checkpoint_*"))
 
 
+@pytest.mark.parametrize("weight", [0.0, 0.01])
+def test_a_loss_without_effect_is_reported(weight: float, scene: Path, tmp_path: Path) -> None:
+    """The ball has alpha and a constant background."""
+    events: list[dict[str, Any]] = []
+    train.run(job(tmp_path, settings(**{**QUICK, "iterations": 3}, plain_loss_weight=weight), poses=scene, events=events))
+    assert any("train.plain_loss_weight" in str(event.get("text")) for event in events) == (weight > 0)
+
+
 def test_it_leaves_a_field_a_log_a_curve_and_previews(scene: Path, tmp_path: Path, undisturbed: str) -> None:
     events: list[dict[str, Any]] = []
     made = job(tmp_path, settings(**QUICK), poses=scene, events=events)
