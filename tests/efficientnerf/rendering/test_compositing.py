@@ -44,6 +44,16 @@ def test_beyond_the_cap_the_density_has_no_gradient_and_stays_finite() -> None:
     assert float(out.opacity.detach()) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("column", [0, 3])
+@pytest.mark.parametrize("activation", ["exp", "softplus"])
+def test_what_is_no_number_shows_in_its_ray_alone(activation: str, column: int) -> None:
+    raw = torch.zeros(4, 28)
+    raw[1, column] = math.nan
+    out = dispatch.composite(raw, torch.full((4,), 0.1), torch.tensor([0, 2, 4]), torch.full((2, 9), 0.28), torch.ones(2, 3), activation)
+    assert out.colour[0].isnan().any()
+    assert out.colour[1].isfinite().all()
+
+
 def test_splitting_a_sample_in_two_leaves_the_pixel_unchanged() -> None:
     b = in_float32(bundle(2))
     whole = dispatch.composite(*b, "softplus")
