@@ -200,7 +200,11 @@ def recover(run: Path, stages: Collection[str]) -> list[str]:
         if files.exists(work / f"old-{stage}"):
             done.append(f"{stage}: {_recovered(run, stage, work / f'old-{stage}')}")
         if files.is_folder(work / stage):
-            _clear_published(run, stage, work / stage)
+            published = _sealed(run / stage, stage)
+            place = None if published is None else workplace(run, stage, published.request)
+            if place is not None and files.is_folder(place.folder) and not files.exists(place.out):
+                files.discard(place.folder, work)
+            _remove_if_empty(work / stage)
     for path in list(work.iterdir()):
         if files.is_trash(path.name):
             files.remove(path)
@@ -225,14 +229,6 @@ def _recovered(run: Path, stage: str, old: Path) -> str:
     files.rename(old, target)
     _sync(work, run)
     return "a replacement that was cut short was undone"
-
-
-def _clear_published(run: Path, stage: str, root: Path) -> None:
-    published = _sealed(run / stage, stage)
-    for folder in list(root.iterdir()):
-        if published is not None and folder.name == published.request.digest and files.is_folder(folder) and not files.exists(folder / "out"):
-            files.discard(folder, run / WORK)
-    _remove_if_empty(root)
 
 
 def _remove_if_empty(folder: Path) -> None:

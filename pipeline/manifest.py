@@ -13,7 +13,7 @@ import platform
 import re
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -46,12 +46,9 @@ class Request:
     inputs: dict[str, Sha256]  # need -> digest of its artifact
     source: dict[str, _Sha256OrAbsent] | None = None  # path relative to the source -> SHA-256 (or ABSENT); None for a stage that does not read the source
 
-    def plain(self) -> dict[str, Any]:
-        return {"stage": self.stage, "version": self.version, "settings": self.settings, "inputs": self.inputs, "source": self.source}
-
     @property
     def digest(self) -> str:
-        return hashlib.sha256(files.canonical_json(self.plain())).hexdigest()
+        return hashlib.sha256(files.canonical_json(asdict(self))).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -67,19 +64,27 @@ class Output:
 def tool_versions() -> tuple[tuple[str, str], ...]:
     """(name, version) of Python, the platform and the packages that this distribution requires and that are installed."""
     found = {"python": platform.python_version(), "platform": platform.platform(), "implementation": sys.implementation.name}
-    try:
-        requirements = [DISTRIBUTION, *(importlib.metadata.requires(DISTRIBUTION) or [])]
-    except importlib.metadata.PackageNotFoundError:
-        requirements = []
-    for requirement in requirements:
-        name = re.match(r"[A-Za-z0-9._-]+", requirement)
-        if name is None or "extra ==" in requirement:
-            continue
-        try:
-            found[name.group().lower()] = importlib.metadata.version(name.group())
-        except importlib.metadata.PackageNotFoundError:
-            continue
+    packages = [DISTRIBUTION, *(name for name, extra in requirements() if not extra)]
+    found |= {name.lower(): version for name in packages if (version := version_of(name)) is not None}
     return tuple(sorted(found.items()))
+
+
+def requirements() -> list[tuple[str, str]]:
+    """(package, the extra that needs it, or nothing) as the installed version of this distribution states them."""
+    try:
+        lines = importlib.metadata.requires(DISTRIBUTION) or ()
+    except importlib.metadata.PackageNotFoundError:
+        return []
+    found = [re.match(r"([\w.-]+)(?:.*extra == ['\"](\w+)['\"])?", line) for line in lines]
+    return [(match[1], match[2] or "") for match in found if match]
+
+
+def version_of(package: str) -> str | None:
+    """The installed version; None where it is not installed."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 @dataclass(frozen=True)
@@ -104,7 +109,9 @@ class Manifest:
 
     @property
     def digest(self) -> str:
-        return artifact_digest(self.outputs)
+        """SHA-256 over the sorted names and hashes of the outputs that do not depend on the clock."""
+        rows = [[name, output.sha256] for name, output in sorted(self.outputs.items()) if not output.volatile]
+        return hashlib.sha256(files.canonical_json(["artifact", rows])).hexdigest()
 
     @property
     def size(self) -> int:
@@ -112,30 +119,12 @@ class Manifest:
         return sum(output.size for output in self.outputs.values())
 
     def to_bytes(self) -> bytes:
-        value = {
-            "format": FORMAT,
-            "format_version": VERSION,
-            "request": self.request.plain(),
-            "request_digest": self.request.digest,
-            "outputs": {name: _plain_output(output) for name, output in self.outputs.items()},
-            "digest": self.digest,
-            "seconds": self.seconds,
-            "peak_memory": self.peak_memory,
-            "cpu_seconds": self.cpu_seconds,
-            "cores": self.cores,
-            "facts": self.facts,
-            "resumed": self.resumed,
-            "made": self.made,
-            "versions": self.versions,
-        }
+        value = {"format": FORMAT, "format_version": VERSION, **asdict(self), "request_digest": self.request.digest, "digest": self.digest}
+        for output in value["outputs"].values():
+            if not output["volatile"]:
+                del output["volatile"]
         value["checksum"] = hashlib.sha256(files.canonical_json(value)).hexdigest()
         return files.pretty_json(value)
-
-
-def artifact_digest(outputs: dict[str, Output]) -> str:
-    """SHA-256 over the sorted names and hashes of the outputs that do not depend on the clock."""
-    rows = [[name, outputs[name].sha256] for name in sorted(outputs) if not outputs[name].volatile]
-    return hashlib.sha256(files.canonical_json(["artifact", rows])).hexdigest()
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -151,11 +140,6 @@ def read_manifest(folder: Path) -> Manifest:
         raise CorruptArtifact(f"{where}: {error}", (where,)) from None
     except (ValueError, OverflowError, RecursionError) as error:  # of msgspec, too
         raise CorruptArtifact(f"{where}: {printable(error, 300)}", (where,)) from None
-
-
-def _plain_output(output: Output) -> dict[str, Any]:
-    plain: dict[str, Any] = {"sha256": output.sha256, "size": output.size}
-    return {**plain, "volatile": True} if output.volatile else plain
 
 
 def _parsed(value: Any) -> Manifest:

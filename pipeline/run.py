@@ -92,7 +92,6 @@ class Run:
     created: float = field(default_factory=time.time)
     resume_text: ResumeText = field(default=resume_in_words, repr=False, compare=False)  # how to go on with the run, for messages
     stages: frozenset[str] | None = field(default=None, repr=False, compare=False)  # names of the stages that it may have, see `refuse_links`
-    _holds: int = field(default=0, init=False, repr=False, compare=False)
     _lease: Lease | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -171,23 +170,18 @@ class Run:
 
         Raises RunLocked if another process holds it, CorruptArtifact if the run holds links.
         """
-        if self._holds:
-            self._holds += 1
-            try:
-                yield
-            finally:
-                self._holds -= 1
+        if self._lease is not None:
+            yield
             return
         refuse_links(self.path, self.stages)  # before the lock's file is opened
         with lock(self.path) as self._lease:
-            self._holds = 1
             try:
                 self._clear_temporaries()
                 if files.exists(self.path / NAME):
                     self._set(_recorded(self.path))
                 yield
             finally:
-                self._holds, self._lease = 0, None
+                self._lease = None
 
     def check_held(self) -> None:
         """Raise RunLocked where the lock that this process held was taken over: a machine may sleep, or lose the file server for a while."""
@@ -209,13 +203,8 @@ class Run:
             "version": VERSION,
             "source": None if self.source is None else str(self.source),
             **({"also": [str(path) for path in self.also]} if self.also else {}),
-            "settings": self.settings,
-            "preset": self.preset,
-            "seed": self.seed,
-            "device": self.device,
-            "memory": self.memory,
+            **{name: getattr(self, name) for name in ("settings", "preset", "seed", "device", "memory", "created")},
             **({"viewer": self.viewer} if self.viewer else {}),
-            "created": self.created,
         }
 
     def _set(self, values: dict[str, Any]) -> None:

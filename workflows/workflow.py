@@ -14,7 +14,7 @@ class Workflow:
 
     stages: tuple[Stage, ...]  # in order
     presets: Path  # the folder of its presets, TOML files
-    child: str = "workflows.fleet.child"  # the module that runs its stages in processes of their own; see `pipeline.executors.serving`
+    child: str = "workflows.fleet.program"  # the module that runs its stages in processes of their own; see `pipeline.executors.serving`
     # (stage, run, its sources, settings by stage, bytes of memory or None) -> bytes that the stage writes
     space: Callable[[str, Path, Sequence[Path], Mapping[str, Any], int | None], int] = lambda *_: 0
     # (stage, run, its sources, settings by stage, device) -> bytes that the stage takes; None: not known, it has a share of its worker's

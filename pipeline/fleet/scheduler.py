@@ -6,6 +6,7 @@ A scene's run is authoritative: published stages are never done again, whatever 
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +93,8 @@ class Scheduler:
             raise
         finally:
             self.workers.close()
-        self._write("interrupted" if number is not None and self._open else "cancelled" if self._cancelled else "done" if self._all_done() else "failed")
+        ending: FleetWord = "done" if self.state.exit_code == 0 else "failed"
+        self._write("interrupted" if number is not None and self._open else "cancelled" if self._cancelled else ending)
         if number is not None and self._open:
             raise Interrupted(number)
         return self.state
@@ -102,9 +104,6 @@ class Scheduler:
         if not self._open:
             self._take_requests()
         return bool(self._open)
-
-    def _all_done(self) -> bool:
-        return all(each.state.state == "done" for each in self._all.values())
 
     def _look(self) -> bool:
         """Now and then: which workers there are, what was requested, whether the fleet is still ours. Returns whether the check was due."""
@@ -210,9 +209,7 @@ class Scheduler:
         memory = each.attempts.memory if memory is None else memory
         request: dict[str, Any] = {"kind": each.what, "run": str(self.fleet / each.state.run), "next": {"device": self.device, "memory": self._largest}}
         if each.what == "prepare":
-            scene = each.state.scene()
-            plain = {"name": scene.name, "sources": list(scene.sources), "settings": scene.settings, "preset": scene.preset, "seed": scene.seed}
-            request |= {"scene": plain, "memory": worker.share_of_memory}
+            request |= {"scene": asdict(each.state.scene()), "memory": worker.share_of_memory}
         elif each.what in self.stages:
             donor = self._donor(each)
             facts = {"stage": each.what, "device": self.device if self.stages[each.what].uses_device else "cpu", "memory": memory}

@@ -10,6 +10,7 @@ A fleet.json may be untrusted: every value is checked and bounded when it is rea
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -136,10 +137,7 @@ class Totals:
 
     @classmethod
     def of(cls, scenes: Sequence[SceneState]) -> Totals:
-        counts = dict.fromkeys(("waiting", "running", "done", "failed", "quarantined"), 0)
-        for scene in scenes:
-            counts[scene.state] += 1
-        return cls(**counts)
+        return cls(**Counter(scene.state for scene in scenes))
 
 
 @dataclass

@@ -43,13 +43,6 @@ def has_cuda() -> bool:
     return cuda_device_count() > 0 and torch_has_cuda()
 
 
-def _torch_sees_one() -> bool:
-    """Whether torch itself finds a CUDA device; importing it takes seconds."""
-    import torch  # takes seconds
-
-    return torch.cuda.is_available()
-
-
 def resolve_device(wanted: str) -> str:
     """`auto`, `cpu` or `cuda` as `cpu` or `cuda`; UsageError where cuda is requested and there is none."""
     if wanted == "cpu":
@@ -57,8 +50,11 @@ def resolve_device(wanted: str) -> str:
     if has_cuda():
         return "cuda"
     if wanted == "cuda":
-        if torch_has_cuda() and _torch_sees_one():  # the management library may be missing, or hidden from the loader, where the driver is not
-            return "cuda"
+        if torch_has_cuda():
+            import torch  # takes seconds
+
+            if torch.cuda.is_available():  # the management library may be missing, or hidden from the loader, where the driver is not
+                return "cuda"
         why = "torch was built without CUDA" if cuda_device_count() else "no CUDA device was found"
         raise UsageError(f"--device cuda: {why}. Use --device cpu, or auto.")
     return "cpu"

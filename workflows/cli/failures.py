@@ -49,20 +49,15 @@ def judged(error: BaseException) -> tuple[int, str]:
 
 
 def _of_the_system(error: OSError) -> str:
-    if isinstance(error, FileNotFoundError) and not error.filename and _working_folder_is_gone():
-        return "the working folder is gone: it was deleted or moved, and relative paths lead nowhere. Change to another folder, or give absolute paths."
+    if isinstance(error, FileNotFoundError) and not error.filename:
+        try:
+            os.getcwd()
+        except FileNotFoundError:
+            return "the working folder is gone: it was deleted or moved, and relative paths lead nowhere. Change to another folder, or give absolute paths."
     what = error.strerror or type(error).__name__
     if is_disk_full(error):
         return f"{error.filename or 'the disk'}: {what}. Free some space and run the same command again; nothing is lost."
     return f"{error.filename}: {what}." if error.filename else f"{what}."
-
-
-def _working_folder_is_gone() -> bool:
-    try:
-        os.getcwd()
-    except FileNotFoundError:
-        return True
-    return False
 
 
 def _shortened(text: str) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from efficientnerf.backends.kernel_cache import are_compiled
 from pipeline.artifact import listed
@@ -60,7 +61,6 @@ class Plan:
 
     run: Run  # a Run with the new settings
     new: bool  # whether its folder has yet to be made
-    device: str  # "auto", "cpu" or "cuda" as requested
     memory: Limit | None  # what stages may take
     warnings: list[str]  # for the user
     again: Callable[[], Plan]  # makes the plan anew, of what run.json holds then
@@ -72,14 +72,16 @@ class Plan:
         The settings that the options change are those that run.json holds under the lock, whatever it held before.
         """
         if self.new:
-            facts = {name: getattr(self.run, name) for name in ("preset", "seed", "device", "memory", "viewer", "also")}
-            facts["resume_text"] = resume_command
-            Run.create(self.run.path, self.run.source, self.run.settings, **facts)
+            Run.create(self.run.path, resume_text=resume_command, **_choices(self.run))
         run = recorded_run(self.run.path)
         with run.locked():
-            now = self.again().run
-            run.update(**{name: getattr(now, name) for name in ("source", "also", "settings", "preset", "seed", "device", "memory", "viewer")})
+            run.update(**_choices(self.again().run))
             yield run
+
+
+def _choices(run: Run) -> dict[str, Any]:
+    """What options may change of a run."""
+    return {name: getattr(run, name) for name in ("source", "also", "settings", "preset", "seed", "device", "memory", "viewer")}
 
 
 def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
@@ -90,10 +92,10 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
     if device is not None and device not in ("auto", "cpu", "cuda"):
         raise UsageError(f"--config {options.config}: device: found {device!r}, expected auto, cpu or cuda.")
     preset = options.preset or config.options.get("preset")
-    standing = recorded_run(path) if os.path.lexists(path / NAME) else None
-    if standing is None:
-        # Before anything else: a wrong folder is the first thing to report.
-        Run(path, resume_text=resume_command).check_free()
+    new = not os.path.lexists(path / NAME)
+    before = Run(path, resume_text=resume_command) if new else recorded_run(path)
+    if new:
+        before.check_free()  # before anything else: a wrong folder is the first thing to report
         if options.source is None:
             raise UsageError(f"{path}: no run is there. To begin one: enerf run SOURCE --out {path}")
         if preset is None:
@@ -102,21 +104,19 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
     settings = Settings(workflow.settings)
     if preset is not None:
         settings.put_table(read_preset(preset, workflow.presets).table, f"preset {preset}")
-    elif standing is not None:
-        dropped = settings.put_recorded(standing.settings)
-        if dropped:
-            warnings.append(f"settings that this version does not have are left out: {listed(dropped)}")
+    elif dropped := settings.put_recorded(before.settings):
+        warnings.append(f"settings that this version does not have are left out: {listed(dropped)}")
     settings.put_table(config.table, f"--config {options.config}")
     settings.put_table(options.table, "the manifest")
     for text in options.sets:
         settings.put_option(text)
-    seed = standing.seed if seed is None and standing is not None and options.preset is not None else seed
+    seed = before.seed if seed is None and options.preset is not None else seed
     if seed is not None:
         settings.put_seed(seed)
     for name, value, origin in _of_poses(options):
         if value is not None:
             settings.put("poses", name, [value], origin)
-    sources = _sources([path for path in (options.source, *options.also) if path is not None], standing)
+    sources = _sources([path for path in (options.source, *options.also) if path is not None], before)
     if options.budget is not None:
         values, names = settings.resolved(), [stage.name for stage in workflow.stages]
         makes = "splats" in names and values["splats"].make != "off"
@@ -127,18 +127,16 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
     if options.target_mib is not None:
         settings.put("bake", "max_mib", [options.target_mib], f"--target-mib {options.target_mib:g}")
     warnings += _without_effect(settings, config, options)
-    memory, limit = _memory(options.memory, standing, warnings)
+    memory, limit = _memory(options.memory, before, warnings)
     warnings += _beyond(limit if options.share is None else Limit(options.share, "its share of the worker's memory"), workflow.stages)
     run = Run(
         path,
         sources[0] if sources else None,
         table_of(settings.resolved()),
-        preset=preset or (standing.preset if standing else None),
-        seed=seed if seed is not None else (standing.seed if standing else None),
-        device=device or (standing.device if standing else None) or "auto",
-        memory=memory, viewer=options.viewer or (standing.viewer if standing else None), also=sources[1:], resume_text=resume_command,
+        preset=preset or before.preset, seed=before.seed if seed is None else seed, device=device or before.device or "auto",
+        memory=memory, viewer=options.viewer or before.viewer, also=sources[1:], resume_text=resume_command,
     )  # fmt: skip
-    return Plan(run, standing is None, run.device or "auto", limit, warnings, lambda: plan_run(path, workflow, options))
+    return Plan(run, new, limit, warnings, lambda: plan_run(path, workflow, options))
 
 
 STEPS = (("train", "iterations"), ("bake", "refine_steps"))  # settings that a time budget takes the place of
@@ -174,9 +172,9 @@ def _of_poses(options: Options) -> tuple[tuple[str, object, str], ...]:
     )
 
 
-def _memory(given: str | None, standing: Run | None, warnings: list[str]) -> tuple[int | None, Limit | None]:
+def _memory(given: str | None, before: Run, warnings: list[str]) -> tuple[int | None, Limit | None]:
     """The bytes to record, None where the machine decides, and the limit that holds now. Raises UsageError."""
-    recorded = standing.memory if standing is not None and given is None else None
+    recorded = before.memory if given is None else None
     asked = None if given in (None, "auto") else parse_size(given)
     here, limit = limit_for(None, None), limit_for(asked, recorded)
     if asked is not None and here is not None and asked > here.bytes:
@@ -199,9 +197,9 @@ def _beyond(limit: Limit | None, stages: Sequence[Stage]) -> list[str]:
     return found
 
 
-def _sources(given: Sequence[Path], standing: Run | None) -> tuple[Path, ...]:
+def _sources(given: Sequence[Path], before: Run) -> tuple[Path, ...]:
     """The sources to record. They cannot change once poses have been made of them, unless they no longer exist."""
-    recorded = tuple(standing.sources.values()) if standing is not None else ()
+    recorded = tuple(before.sources.values())
     if not given:
         return recorded
     for path in given:
@@ -211,10 +209,10 @@ def _sources(given: Sequence[Path], standing: Run | None) -> tuple[Path, ...]:
     if len(set(real)) < len(real) or len(real) > MOST_SOURCES:
         raise UsageError(f"{listed([str(path) for path in given])}: a source was given twice, or more than {MOST_SOURCES}. Give each once.")
     unchanged = not recorded or real == [os.path.realpath(path) for path in recorded]
-    if standing is not None and not unchanged and standing.folder("poses").exists() and all(path.exists() for path in recorded):
+    if not unchanged and before.folder("poses").exists() and all(path.exists() for path in recorded):
         was, now = (listed([str(path) for path in paths]) for paths in (recorded, sources))
-        remedy = f"Give a new folder for another source, or go on: {standing.how_to_resume()}"
-        raise UsageError(f"{standing.path}: was made from {was}, not from {now}. {remedy}")
+        remedy = f"Give a new folder for another source, or go on: {before.how_to_resume()}"
+        raise UsageError(f"{before.path}: was made from {was}, not from {now}. {remedy}")
     return sources
 
 

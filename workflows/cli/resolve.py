@@ -22,7 +22,7 @@ from workflows.asset import WORKFLOW
 
 Table = Mapping[str, Mapping[str, Any]]
 # Besides the tables of the stages, a configuration file may hold the values of the dedicated options.
-CONFIG_OPTIONS = ("preset", "device", "seed")
+CONFIG_OPTIONS = {"preset": str, "device": str, "seed": int}
 MAX_TOML = 2**16  # bytes; all settings together are a tenth of it
 MAX_SHOWN = 200  # characters of a value in a message
 _MAX_DOTS = 1000  # on a line: tomllib takes memory by the square of a key's parts
@@ -94,10 +94,10 @@ def read_config(path: Path) -> Config:
     """A configuration file. Raises UsageError, BadInput and UnknownSetting."""
     content = read_toml("--config", path)
     options = {name: content.pop(name) for name in CONFIG_OPTIONS if name in content}
-    for name, kind in (("preset", str), ("device", str), ("seed", int)):
-        if name in options and type(options[name]) is not kind:
-            found = printable(_text_of(options[name]), MAX_SHOWN)
-            raise UsageError(f"--config {path}: {name}: found {found}, expected {'a whole number' if kind is int else 'text'}.")
+    for name, value in options.items():
+        if type(value) is not CONFIG_OPTIONS[name]:
+            expected = "a whole number" if CONFIG_OPTIONS[name] is int else "text"
+            raise UsageError(f"--config {path}: {name}: found {printable(_text_of(value), MAX_SHOWN)}, expected {expected}.")
     for name, value in content.items():
         if not isinstance(value, dict):
             raise UnknownSetting(

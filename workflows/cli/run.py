@@ -107,7 +107,7 @@ def stage(name: str, run_folder: Path, force: bool, dry_run: bool, as_json: bool
 
 def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, fail_on: str | None = None, jobs: int | None = 1, **selection: Any) -> int:
     """Run a plan, display its progress, and print the summary; returns the exit code."""
-    device = resolve_device(plan.device)
+    device = resolve_device(plan.run.device or "auto")
     for option in ("until", "start"):  # before a run is created
         check_stage(selection.get(option), workflow().settings, f"--{'from' if option == 'start' else option} ")
     started = time.monotonic()

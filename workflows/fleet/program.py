@@ -1,14 +1,17 @@
-"""The workflow's part of a fleet, unknown to the engine: how a scene becomes a run, what is shown of it, its pages."""
+"""The workflow's part of a fleet, unknown to the engine: how a scene becomes a run, what is shown of it, its pages. As a program it is the process that
+stages run in, which `pipeline.executors.child` starts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pipeline.executors.serving import serve
 from pipeline.run import NAME, Run
 from pipeline.runner import refuse_what_cannot_work
 from pipeline.stage import Stage, settings_of
 from stages.artifacts import BakeOutputs, EvaluateOutputs
+from workflows.asset import WORKFLOW
 from workflows.cli.request import Options, plan_run
 from workflows.cli.target import resume_command
 from workflows.inspection.status import camera_verdict, result_verdict
@@ -66,3 +69,7 @@ class WorkflowProgram:
         opened = self._open(run)
         with opened.locked():
             write_pages(opened, self.stages)
+
+
+if __name__ == "__main__":
+    serve(WorkflowProgram(WORKFLOW))

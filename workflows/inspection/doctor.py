@@ -8,7 +8,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from efficientnerf.backends import kernel_cache
 from pipeline.errors import PipelineError
 from pipeline.executors.cores import cores
 from pipeline.executors.memory import available_now, usable_memory
+from pipeline.manifest import DISTRIBUTION, requirements, version_of
 from pipeline.text import printable
 from workflows.cli.device import cuda_device_count, torch_has_cuda
 from workflows.cli.options import common_options, json_option
@@ -51,7 +51,8 @@ def doctor(seconds: int, as_json: bool) -> None:
 
     The exit code is 3 if the self-test fails.
     """
-    found = {**_machine(), "packages": _packages(), "caches": caches(), "optional": _optional()}
+    packages = {name: version_of(name) for name, extra in requirements() if not extra}
+    found = {**_machine(), "packages": packages, "caches": caches(), "optional": _optional()}
     found["self_test"] = _self_test(seconds)
     if as_json:
         write_json(found | {"exit_code": FAILED if found["self_test"]["state"] == "failed" else 0}, indent=1)
@@ -101,7 +102,7 @@ def _machine() -> dict[str, Any]:
     lines = dict(re.findall(r"^(model name|flags|Features)\s*: (.*)$", text, re.MULTILINE))
     limit, devices = usable_memory(), cuda_device_count()
     return {
-        "enerf": _version("efficientnerf"),
+        "enerf": version_of(DISTRIBUTION),
         "python": platform.python_version(),
         "system": platform.platform(),
         "processor": lines.get("model name") or platform.processor() or platform.machine(),
@@ -117,27 +118,10 @@ def _machine() -> dict[str, Any]:
     }
 
 
-def _version(name: str) -> str | None:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
-
-
-def _requirements() -> list[tuple[str, str]]:
-    """(package, the extra that needs it, or nothing) as the installed version states them."""
-    found = [re.match(r"([\w.-]+)(?:.*extra == ['\"](\w+)['\"])?", line) for line in requires("efficientnerf") or ()]
-    return [(match[1], match[2] or "") for match in found if match]
-
-
-def _packages() -> dict[str, str | None]:
-    return {name: _version(name) for name, extra in _requirements() if not extra}
-
-
 def _optional() -> list[dict[str, Any]]:
-    needed = {extra: [name for name, of in _requirements() if of == extra] for extra in EXTRAS}
+    needed = {extra: [name for name, of in requirements() if of == extra] for extra in EXTRAS}
     return [
-        {"extra": extra, "for": purpose, "installed": all(map(_version, needed[extra])), "get": f"pip install 'efficientnerf[{extra}]'"}
+        {"extra": extra, "for": purpose, "installed": all(map(version_of, needed[extra])), "get": f"pip install 'efficientnerf[{extra}]'"}
         for extra, purpose in EXTRAS.items()
     ]
 
