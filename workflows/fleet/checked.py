@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -69,16 +70,22 @@ class Checker:
         where = ", ".join(part for part in (f"line {line}" if line else "", f"scene {printable(scene, 100)}" if scene else "") if part)
         self.mistakes.append((line or 0, f"{where}: {text}" if where else text))
 
+    @contextmanager
+    def kept(self, line: int | None = None, scene: str | None = None) -> Iterator[None]:
+        """While open, a UsageError is kept as a mistake."""
+        try:
+            yield
+        except UsageError as error:
+            self.mistake(str(error).removeprefix(": ").removeprefix("--"), line=line, scene=scene)
+
     def end(self) -> None:
         """Raise Mistakes if there are any."""
-        if not self.mistakes:
-            return
         texts = [text for _, text in sorted(self.mistakes, key=lambda each: each[0])]
-        shown = [*texts[:MOST_SHOWN], f"and {len(texts) - MOST_SHOWN} more"] if len(texts) > MOST_SHOWN else texts
-        what = printable(self.what, 1000)
+        what, more = printable(self.what, 1000), len(texts) - MOST_SHOWN
         if len(texts) == 1:
             raise Mistakes(f"{what}: {texts[0]}", ())
-        raise Mistakes(f"{what}: {len(texts)} mistakes; nothing was run:", tuple(shown))
+        if texts:
+            raise Mistakes(f"{what}: {len(texts)} mistakes; nothing was run:", (*texts[:MOST_SHOWN], *([f"and {more} more"] if more > 0 else [])))
 
     def value(self, stage: str, name: str, value: Any, *, by_hand: bool = False) -> Any:
         """A setting's value as JSON holds it, of a manifest or, `by_hand`, of the command line. Raises UsageError."""
@@ -96,18 +103,21 @@ class Checker:
             self._settings.put_seed(seed)
         return {stage: {name: self.value(stage, name, value, by_hand=True) for name, value in entries.items()} for stage, entries in table.items()}
 
-    def settings(self, table: Mapping[str, Any], line: int | None = None, scene: str | None = None) -> Table:
-        """Stage -> setting -> value of the values that are right; the others are kept as mistakes."""
-        found: Table = {}
-        for stage, entries in table.items():
+    def choice(self, values: Mapping[str, Any], line: int | None = None, scene: str | None = None) -> Choice:
+        """What a manifest has for a scene, or for all: OPTIONS, and tables of settings; what is wrong is kept as mistakes."""
+        found = Choice()
+        for name in (key for key in values if key in OPTIONS):
+            with self.kept(line, scene):
+                self._option(found, name, values[name])
+        for stage, entries in values.items():
+            if stage in OPTIONS:
+                continue
             if not isinstance(entries, Mapping) or not entries:
                 self.unknown(stage, line, scene)
                 continue
             for name, value in entries.items():
-                try:
-                    found.setdefault(stage, {})[name] = self.value(stage, name, value)
-                except UsageError as error:
-                    self.mistake(str(error).removeprefix(": "), line=line, scene=scene)
+                with self.kept(line, scene):
+                    found.settings.setdefault(stage, {})[name] = self.value(stage, name, value)
         return found
 
     def unknown(self, key: str, line: int | None = None, scene: str | None = None) -> None:
@@ -118,16 +128,6 @@ class Checker:
         known = ["source", "sources", *OPTIONS, *self._settings.types]
         text = f"found {printable(key, 100)!r}, expected source, sources, {', '.join(OPTIONS)} or the settings of a stage.{nearest(key, known)}"
         self.mistake(text, line=line, scene=scene)
-
-    def options(self, values: Mapping[str, Any], line: int | None = None, scene: str | None = None) -> Choice:
-        """Those of OPTIONS that are there; mistakes are kept."""
-        found = Choice()
-        for name, value in values.items():
-            try:
-                self._option(found, name, value)
-            except UsageError as error:
-                self.mistake(str(error).removeprefix(": ").removeprefix("--"), line=line, scene=scene)
-        return found
 
     def _option(self, found: Choice, name: str, value: Any) -> None:
         if name == "seed":

@@ -18,7 +18,7 @@ import csv
 import glob
 import io
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -45,7 +45,7 @@ class Entry:
 
     name: str
     sources: list[Any]
-    values: Mapping[str, Any] = field(default_factory=dict)
+    values: dict[str, Any] = field(default_factory=dict)
     line: int | None = None  # of a CSV
 
 
@@ -58,27 +58,25 @@ def read_manifest(given: Sequence[str], workflow: Workflow, fleet: Path, *, over
     roots  folders besides the manifest's own that its sources may lie in
     """
     checker = Checker(workflow, given[0] if len(given) == 1 else f"{len(given)} sources")
-    inside: list[Path] | None = None
     common = Choice()
     if len(given) == 1 and given[0].lower().endswith(SUFFIXES) and not Path(given[0]).is_dir():
         path = Path(given[0])
-        inside = [path.absolute().parent, *roots]
-        common, entries = (_toml if path.suffix.lower() == ".toml" else _csv)(read_text(path, MAX_BYTES), checker)
         base = path.absolute().parent
+        root: Path | None = base
+        common, entries = (_toml if path.suffix.lower() == ".toml" else _csv)(read_text(path, MAX_BYTES), checker)
     else:
         base = Path()  # the working folder, which may be gone: absolute sources need none
         is_pattern = glob.has_magic(given[0]) and not os.path.lexists(given[0])
         found, root = listed_entries(given) if len(given) > 1 else glob_entries(given[0]) if is_pattern else folder_entries(given[0], fleet)
-        inside = None if root is None else [root, *roots]
         entries = [Entry(name, [source]) for name, source in found]
     if not entries and not checker.mistakes:
         raise UsageError(f"{printable(checker.what, 1000)}: holds no scenes; expected folders or videos, each of one scene.")
     if len(entries) > MOST_SCENES:
         raise UsageError(f"{printable(checker.what, 1000)}: found {len(entries)} scenes, expected at most {MOST_SCENES}.")
     _check_names(entries, checker)
-    given_by_hand = over or Choice()
-    given_by_hand = replace(given_by_hand, settings=Checker(workflow, "--set").given(given_by_hand.settings, given_by_hand.seed))
-    reader = _Reader(checker, base, inside, fleet, common, given_by_hand)
+    over = over or Choice()
+    over = replace(over, settings=Checker(workflow, "--set").given(over.settings, over.seed))
+    reader = _Reader(checker, base, None if root is None else [root, *roots], fleet, common, over)
     scenes = [reader.scene(entry) for entry in entries]
     checker.end()
     return scenes
@@ -94,7 +92,7 @@ def _toml(text: str, checker: Checker) -> tuple[Choice, list[Entry]]:
     if not isinstance(tables, dict):
         checker.mistake("scenes: found no tables, expected [scenes.NAME].")
         tables = {}
-    common = _choice(content, checker)
+    common = checker.choice(content)
     entries = []
     for name, table in tables.items():
         if not isinstance(table, dict):
@@ -145,22 +143,18 @@ def _check_columns(columns: list[str], checker: Checker) -> None:
 
 def _row(columns: list[str], cells: list[str], line: int) -> Entry:
     """A scene of a line; empty cells say nothing."""
-    values: dict[str, Any] = {}
+    entry = Entry("", [], {}, line)
     for column, cell in zip(columns, cells, strict=False):
-        if cell and column in OPTIONS:
-            values[column] = Text(cell)
-        elif cell and "." in column:
-            stage, _, name = column.partition(".")
-            values.setdefault(stage, {})[name] = Text(cell)
-    named = dict(zip(columns, cells, strict=False))
-    sources = [cell for column, cell in zip(columns, cells, strict=False) if column == "source" and cell]
-    return Entry(named.get("name", ""), list(sources), values, line)
-
-
-def _choice(values: Mapping[str, Any], checker: Checker, line: int | None = None, scene: str | None = None) -> Choice:
-    options = checker.options({key: value for key, value in values.items() if key in OPTIONS}, line, scene)
-    settings = checker.settings({key: value for key, value in values.items() if key not in OPTIONS}, line, scene)
-    return Choice(settings).over(options)
+        stage, dot, name = column.partition(".")
+        if column == "name":
+            entry.name = cell
+        elif cell and column == "source":
+            entry.sources.append(cell)
+        elif cell and column in OPTIONS:
+            entry.values[column] = Text(cell)
+        elif cell and dot:
+            entry.values.setdefault(stage, {})[name] = Text(cell)
+    return entry
 
 
 def _check_names(entries: Sequence[Entry], checker: Checker) -> None:
@@ -191,7 +185,7 @@ class _Reader:
     def scene(self, entry: Entry) -> Scene:
         """The scene of an entry; mistakes are kept."""
         sources = tuple(self._sources(entry))
-        own = _choice(entry.values, self.checker, entry.line, entry.name)
+        own = self.checker.choice(entry.values, entry.line, entry.name)
         choice = self.over.over(own.over(self.common))
         settings = choice.with_budget(sources, self.checker.workflow)
         return Scene(entry.name, tuple(map(str, sources)), settings, choice.preset, choice.seed)
@@ -202,8 +196,7 @@ class _Reader:
             return
         real = []
         for source in entry.sources:
-            why = self._wrong(entry, source)
-            if why is not None:
+            if (why := self._wrong(entry, source)) is not None:
                 self.checker.mistake(why, line=entry.line, scene=entry.name)
                 continue
             path = Path(os.path.abspath(self.base / source))

@@ -53,10 +53,8 @@ def read_sweeps(texts: Sequence[str], workflow: Workflow) -> list[Sweep]:
             continue
         checked = []
         for value in values:
-            try:
+            with checker.kept():
                 checked.append(checker.value(stage, name, Text(value), by_hand=True))
-            except UsageError as error:
-                checker.mistake(str(error).removeprefix(": "))
         once = {canonical_json(value): value for value in checked}
         found[setting.strip()] = Sweep(stage, name, tuple(once.values()))
     checker.end()
