@@ -12,10 +12,9 @@ from typing import Any
 
 from pipeline.errors import Interrupted, RunLocked, StageFailed
 from pipeline.executors.memory import size_text
-from pipeline.fleet import disk, requests
+from pipeline.fleet import forecast, requests
 from pipeline.fleet.admission import Admission
 from pipeline.fleet.failure import LOCKED_PAUSE, Attempts, remedy
-from pipeline.fleet.forecast import forecast_seconds
 from pipeline.fleet.progress import Progress
 from pipeline.fleet.state import LONGEST_LINE, MOST_LINES, FleetState, FleetWord, Scene, SceneState, StageState, Totals, write_fleet
 from pipeline.fleet.workers import Demand, Message, Task, Worker, Workers
@@ -166,7 +165,7 @@ class Scheduler:
         waiting = {each.number: each for each in self._open if each.task is None and each.not_before <= now and self._has_its_share(each)}
         self._admission.look(self._alive, waiting)
         first = self._admission.waited_for()
-        for each in sorted(waiting.values(), key=lambda each: (each.number not in first, *self._order(each))):
+        for each in sorted(waiting.values(), key=lambda each: (each.number not in first, not self._uses_gpu(each), each.todo is None, each.number)):
             place = self._admission.place(each.number, self._demand(each), avoided=each.attempts.lost_on, preferred=each.last_worker)
             need = each.space.get(each.what, 0)
             if place is not None and ((self._tasks and need >= too_much) or not self._has_disk(each, need)):
@@ -175,7 +174,7 @@ class Scheduler:
             elif place is not None:
                 self._start(each, *place)
         for each in cramped if not self._tasks else ():  # nothing that runs will give any of it back
-            shown = f"{each.what}: writes about {size_text(each.space[each.what])}; {size_text(disk.free_space(self.fleet))} are free in {self.fleet}."
+            shown = f"{each.what}: writes about {size_text(each.space[each.what])}; {size_text(forecast.free_space(self.fleet))} are free in {self.fleet}."
             self._give_up(each, "failed", f"{shown} Free some space, and go on.")
 
     def _has_disk(self, each: Progress, need: int) -> bool:
@@ -183,19 +182,18 @@ class Scheduler:
         if not need:
             return True
         running = [(other, other.space.get(str(other.task.request.get("stage")), 0)) for other in self._tasks.values() if other.task]
-        left = sum(max(0, need - disk.written_in(self.fleet / other.state.run)) for other, need in [(each, need), *running])
-        return left + disk.RESERVE + disk.RESERVE_PER_SCENE * len(self._all) <= disk.free_space(self.fleet)
+        left = sum(max(0, need - forecast.written_in(self.fleet / other.state.run)) for other, need in [(each, need), *running])
+        return left + forecast.RESERVE + forecast.RESERVE_PER_SCENE * len(self._all) <= forecast.free_space(self.fleet)
 
-    def _order(self, each: Progress) -> tuple[bool, bool, int]:
-        uses = each.what in self.stages and self.stages[each.what].uses_device
-        return not (uses and self.device == "cuda"), each.todo is None, each.number
+    def _uses_gpu(self, each: Progress) -> bool:
+        return self.device == "cuda" and each.what in self.stages and self.stages[each.what].uses_device
 
     def _demand(self, each: Progress) -> Demand:
         """The scene's demand: its stage's, or all of the largest worker where that is less: the worker that had more may have gone."""
-        stage, memory = self.stages.get(each.what), each.bytes_needed()
+        memory = each.bytes_needed()
         if memory is not None and self._largest is not None:
             memory = min(memory, self._largest)
-        return Demand(uses_gpu=self.device == "cuda" and stage is not None and stage.uses_device, memory=memory)
+        return Demand(uses_gpu=self._uses_gpu(each), memory=memory)
 
     def _has_its_share(self, each: Progress) -> bool:
         """Whether the scene that makes the next artifact for this one, too, has done so, or never will."""
@@ -337,7 +335,7 @@ class Scheduler:
         self.state.state = ending or "running"
         self.state.note = self.state.note if ending in (None, "interrupted") else None
         self.state.updated, self.state.totals = _now(), Totals.of(self.state.scenes)
-        self.state.forecast_seconds = 0.0 if ending is not None else forecast_seconds(self.state.scenes, list(self.stages), self.state.slots)
+        self.state.forecast_seconds = 0.0 if ending is not None else forecast.forecast_seconds(self.state.scenes, list(self.stages), self.state.slots)
         write_fleet(self.fleet, self.state)
         self._written(self.state)
         self._changed = False

@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -115,10 +115,7 @@ class SceneState:
     @classmethod
     def of(cls, scene: Scene) -> SceneState:
         """The state of a scene that waits."""
-        return cls(
-            scene.name, run=scene.name, sources=list(scene.sources), settings={stage: dict(table) for stage, table in scene.settings.items()},
-            preset=scene.preset, seed=scene.seed, sweep=None if scene.sweep is None else dict(scene.sweep), shares=dict(scene.shares),
-        )  # fmt: skip
+        return cls(**{**asdict(scene), "sources": list(scene.sources)}, run=scene.name)
 
     def scene(self) -> Scene:
         """The scene that it is of."""
@@ -137,7 +134,7 @@ class Totals:
 
     @classmethod
     def of(cls, scenes: Sequence[SceneState]) -> Totals:
-        return cls(**Counter(scene.state for scene in scenes))
+        return cls(**Counter[str](scene.state for scene in scenes))
 
 
 @dataclass

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from pipeline.errors import Interrupted, RunLocked, StageFailed
-from pipeline.fleet import disk, failure, requests, scheduler
+from pipeline.fleet import failure, forecast, requests, scheduler
 from pipeline.fleet.state import Scene, read_fleet
 from pipeline.fleet.workers import Task, Worker
 from tests.pipeline.fleet.simulated import STAGES, Answer, Simulated, done, hurry, run, scene_of, scenes, state_of, what
@@ -220,7 +220,7 @@ def test_jobs_of_a_queue_are_waited_for_and_so_are_those_after_them(tmp_path: Pa
 
 def test_stages_are_admitted_by_what_they_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two of them do not fit side by side, though there are workers for both; one alone never fits and fails by circumstances."""
-    monkeypatch.setattr(disk, "free_space", lambda fleet: disk.RESERVE + 5 * GIB)
+    monkeypatch.setattr(forecast, "free_space", lambda fleet: forecast.RESERVE + 5 * GIB)
     together: list[int] = []
 
     def answer(task: Task) -> dict[str, Any]:
@@ -233,11 +233,11 @@ def test_stages_are_admitted_by_what_they_write(tmp_path: Path, monkeypatch: pyt
     assert max(together) == 1
     assert [scene.state for scene in found.scenes] == ["done", "done", "failed", "done", "done"]
     assert all(words in (state_of(found, "s2").reason or "") for words in ("train", "6.0 GiB", "5.0 GiB", str(tmp_path)))
-    monkeypatch.setattr(disk, "free_space", lambda fleet: disk.RESERVE + 2 * GIB)  # s2 has written most of it, another not
-    monkeypatch.setattr(disk, "written_in", lambda run: 5 * GIB if run.name == "s2" else 0)
+    monkeypatch.setattr(forecast, "free_space", lambda fleet: forecast.RESERVE + 2 * GIB)  # s2 has written most of it, another not
+    monkeypatch.setattr(forecast, "written_in", lambda run: 5 * GIB if run.name == "s2" else 0)
     spacious = Simulated([Worker("a", 2)], lambda task: done(task, space={"poses": 1, "train": 6 * GIB, "bake": 1}))
     assert [scene.state for scene in run(tmp_path / "other", spacious, scenes(3)).scenes] == ["failed", "failed", "done"]
-    monkeypatch.setattr(disk, "free_space", lambda fleet: disk.RESERVE + 7 * GIB)
+    monkeypatch.setattr(forecast, "free_space", lambda fleet: forecast.RESERVE + 7 * GIB)
     assert run(tmp_path, Simulated([Worker("a", 2)], answer), scenes(5), former=found).state == "done"
 
 

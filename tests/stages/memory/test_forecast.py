@@ -11,7 +11,7 @@ import pytest
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import TooLittleMemory
 from pipeline.executors.memory import Limit
-from pipeline.fleet.disk import RESERVE
+from pipeline.fleet.forecast import RESERVE
 from stages.bake import run as bake
 from stages.bake.settings import BakeSettings
 from stages.evaluate import run as evaluate
