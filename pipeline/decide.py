@@ -7,7 +7,6 @@ partial  work on the present request was cut short; the published artifact, if a
 corrupt  the files are not those that were written
 """
 
-import difflib
 import os
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +19,7 @@ from pipeline.hashes import Hashes
 from pipeline.manifest import ABSENT, Manifest, Request
 from pipeline.run import Run
 from pipeline.stage import Stage, hints_of, settings_dict, settings_from
-from pipeline.text import printable
+from pipeline.text import printable, suggestion
 
 _CHANGES_SHOWN = 4
 
@@ -48,8 +47,7 @@ def selection(stages: Sequence[Stage], *, until: str | None, start: str | None, 
     names = [stage.name for stage in stages]
     for name in (until, start, only):
         if name is not None and name not in names:
-            near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-            raise UsageError(f"{name}: no such stage. " + (f"Did you mean {near[0]}?" if near else f"There are: {', '.join(names)}."))
+            raise UsageError(f"{name}: no such stage. {suggestion(name, names)}")
     if only is not None:
         if until is not None or start is not None:
             raise UsageError("a single stage goes together with neither a first nor a last one")

@@ -181,35 +181,32 @@ class _Runner:
     def one(self, stage: Stage, forced: bool, execute: Executor, memory: Limit | None) -> Outcome:
         """Decide about one stage, and run it if needed."""
         with self._lock:
-            return self._one(stage, forced, execute, memory)
-
-    def _one(self, stage: Stage, forced: bool, execute: Executor, memory: Limit | None) -> Outcome:
-        decision = decide(stage, self.run, self.hashes)
-        if decision.note:
-            self.emit("warning" if not decision.fresh else "message", stage.name, text=decision.note)
-        if decision.fresh and not forced and decision.manifest is not None:
-            self._clear(stage, decision.manifest)
-            self.emit("stage_skipped", stage.name, reason="up to date", digest=decision.manifest.digest)
-            return _outcome(stage, "skipped", None, decision.manifest)
-        reason = decision.reason or "forced"
-        request = self._runnable(stage, decision, reason)
-        place = artifact.workplace(self.run.path, stage.name, request)
-        started = time.monotonic()
-        try:
-            made = artifact.finished(place, stage.name)
-            if made is None:
-                made = self._make(stage, request, place, reason, execute, memory)
-            else:
-                self.emit("message", stage.name, text=f"{stage.name} was done before; only its publication had been cut short")
-            self.run.check_held()
-            artifact.publish(self.run.path, stage.name, place)
-        except (Exception, KeyboardInterrupt) as error:
-            self._failed(stage, place, error)
-        self.hashes.forget(f"{stage.name}/", {f"{stage.name}/{name}" for name in made.outputs})
-        facts = {"seconds": time.monotonic() - started, "size": made.size, "digest": made.digest, "files": len(made.outputs)}
-        facts |= {"peak_memory": made.peak_memory, "cpu_seconds": made.cpu_seconds, "cores_busy": made.cores_busy, "cores": made.cores}
-        self.emit("stage_done", stage.name, reason=reason, **facts)
-        return _outcome(stage, "ran", reason, made)
+            decision = decide(stage, self.run, self.hashes)
+            if decision.note:
+                self.emit("warning" if not decision.fresh else "message", stage.name, text=decision.note)
+            if decision.fresh and not forced and decision.manifest is not None:
+                self._clear(stage, decision.manifest)
+                self.emit("stage_skipped", stage.name, reason="up to date", digest=decision.manifest.digest)
+                return _outcome(stage, "skipped", None, decision.manifest)
+            reason = decision.reason or "forced"
+            request = self._runnable(stage, decision, reason)
+            place = artifact.workplace(self.run.path, stage.name, request)
+            started = time.monotonic()
+            try:
+                made = artifact.finished(place, stage.name)
+                if made is None:
+                    made = self._make(stage, request, place, reason, execute, memory)
+                else:
+                    self.emit("message", stage.name, text=f"{stage.name} was done before; only its publication had been cut short")
+                self.run.check_held()
+                artifact.publish(self.run.path, stage.name, place)
+            except (Exception, KeyboardInterrupt) as error:
+                self._failed(stage, place, error)
+            self.hashes.forget(f"{stage.name}/", {f"{stage.name}/{name}" for name in made.outputs})
+            facts = {"seconds": time.monotonic() - started, "size": made.size, "digest": made.digest, "files": len(made.outputs)}
+            facts |= {"peak_memory": made.peak_memory, "cpu_seconds": made.cpu_seconds, "cores_busy": made.cores_busy, "cores": made.cores}
+            self.emit("stage_done", stage.name, reason=reason, **facts)
+            return _outcome(stage, "ran", reason, made)
 
     def _make(self, stage: Stage, request: Request, place: Workplace, reason: str, execute: Executor, memory: Limit | None) -> Manifest:
         """Run the stage and seal its outputs."""

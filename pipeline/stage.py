@@ -21,7 +21,7 @@ from pipeline.errors import Interrupted, UnknownSetting, UsageError
 from pipeline.executors.memory import Limit
 from pipeline.links import is_stage_name
 from pipeline.run import named
-from pipeline.text import printable
+from pipeline.text import printable, suggestion
 
 T = TypeVar("T")
 Report = Callable[[dict[str, Any]], None]
@@ -157,7 +157,8 @@ def settings_from(cls: type[T], mapping: Mapping[str, Any], *, where: str = "") 
     values = {}
     for name, value in mapping.items():
         if name not in names:
-            raise UnknownSetting(_unknown(prefix, printable(name, 80), names))
+            shown = printable(name, 80)
+            raise UnknownSetting(f"{prefix}{shown}: no such setting. {suggestion(shown, names, prefix)}")
         try:
             values[name] = msgspec.convert(value, hints[name], strict=True)
             if any(isinstance(number, int) and abs(number) >= 2**63 for number in _numbers(values[name])):
@@ -177,12 +178,6 @@ def settings_of(stages: Iterable[Stage], table: Mapping[str, Mapping[str, Any]])
 def settings_dict(settings: Any) -> dict[str, Any]:
     """The plain values of an instance of a settings dataclass, as JSON holds them (tuples become lists)."""
     return {f.name: plain(getattr(settings, f.name)) for f in dataclasses.fields(settings)}
-
-
-def _unknown(prefix: str, name: str, known: list[str]) -> str:
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    remedy = f"Did you mean {prefix}{near[0]}?" if near else f"There are: {', '.join(known) or 'none'}."
-    return f"{prefix}{name}: no such setting. {remedy}"
 
 
 def plain(value: Any) -> Any:

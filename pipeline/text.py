@@ -3,6 +3,9 @@
 All that a stranger wrote goes through `printable` where it enters a message; every line goes through it once more on its way to a terminal.
 """
 
+import difflib
+from collections.abc import Sequence
+
 
 def printable(text: object, limit: int | None = None) -> str:
     """`text` with every character that is no letter, mark, number, punctuation, symbol or plain space as an escape: \\n, \\x1b, \\u202e, \\udcff.
@@ -19,3 +22,9 @@ def printable(text: object, limit: int | None = None) -> str:
     if limit is not None and len(shown) > limit:
         shown = shown[: max(limit - 1, 0)] + "…"
     return shown
+
+
+def suggestion(name: str, known: Sequence[str], prefix: str = "") -> str:
+    """`Did you mean x?` of the nearest name that is known, or all that are."""
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"Did you mean {prefix}{near[0]}?" if near else f"There are: {', '.join(known) or 'none'}."

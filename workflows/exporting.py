@@ -242,14 +242,11 @@ def _meshed(export: Export, tree: NerfTree, border: Region | None, frame: Source
     refuse_more_than(export.limit, str(export.what), need, remedy)
     share = 1.0 if choice == "off" else SURFACE_SHARE
 
-    def surface(done: int, total: int, text: str) -> None:
-        progress(round(1000 * share * done / max(total, 1)), 1000, text)
+    def between(begin: float, end: float) -> Progress:
+        return lambda done, total, text: progress(round(1000 * (begin + (end - begin) * done / max(total, 1))), 1000, text)
 
-    def texture(done: int, total: int, text: str) -> None:
-        progress(round(1000 * (share + (1 - share) * done / max(total, 1))), 1000, text)
-
-    mesh, _ = mesh_of(tree, wanted, surface, border)
-    return in_capture(textured(mesh, tree, captured, choice, wanted.texture_size, texture), frame)
+    mesh, _ = mesh_of(tree, wanted, between(0.0, share), border)
+    return in_capture(textured(mesh, tree, captured, choice, wanted.texture_size, between(share, 1.0)), frame)
 
 
 def _write_mesh(export: Export, mesh: Mesh, frame: SourceFrame) -> list[Written]:

@@ -164,16 +164,12 @@ def _create(aside: Path, path: Path) -> bool:
             return True
         if error.errno not in _NO_LINKS:
             raise
-        return _created(path, aside.read_bytes())
-    return True
-
-
-def _created(path: Path, data: bytes) -> bool:
-    try:
-        with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666), "wb") as file:
-            file.write(data)
-    except FileExistsError:
-        return False
+        try:
+            descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+        except FileExistsError:
+            return False
+        with open(descriptor, "wb") as file:
+            file.write(aside.read_bytes())
     return True
 
 

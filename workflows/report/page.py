@@ -107,7 +107,9 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
     damaged: list[str] = []
     found = _read(folder / EVALUATE.metrics, Metrics, damaged)
     made = [each.manifest for each in decisions if each.manifest is not None]
-    inside = _inside(folder)
+    inside = None
+    with suppress(PipelineError):  # of a run whose cameras or frame cannot be read nothing is measured
+        inside = measured(folder)
     return _template().render(
         folder=folder,
         name=folder.name,
@@ -185,13 +187,6 @@ def _cameras(folder: Path, damaged: list[str]) -> dict[str, Any] | None:
     if report.reprojection_error is not None:
         text += f", mean reprojection error {report.reprojection_error:.2f} px"
     return {"text": text, "rejected": [(each.name, each.reason) for each in report.rejected or []], "warnings": report.warnings or []}
-
-
-def _inside(folder: Path) -> Measured | None:
-    """What can be measured in, of a run whose cameras and frame can be read."""
-    with suppress(PipelineError):
-        return measured(folder)
-    return None
 
 
 def _sides(folder: Path, inside: Measured | None) -> list[str]:

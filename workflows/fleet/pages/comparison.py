@@ -3,7 +3,7 @@
 Seconds are those that a scene takes by itself: a stage that another scene made for it counts as if it had made it.
 """
 
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -25,6 +25,9 @@ PLOTS = {
     f"{FOLDER}/psnr_over_seconds.png": ("seconds", "time of all stages / s", "PSNR over the time of all stages; the line: best at their time"),
     f"{FOLDER}/psnr_over_megabytes.png": ("megabytes", "asset / MB", "PSNR over the size of the asset; the line: best at their size"),
 }
+FIGURES: dict[str, Callable[[float], str]] = {  # of a Result, and how they are shown
+    "psnr": "{:.2f}".format, "ssim": "{:.3f}".format, "seconds": duration, "megabytes": "{:.2f}".format,
+}  # fmt: skip
 _TABLES = 200  # scenes with a table of their own
 
 
@@ -99,7 +102,7 @@ def _mean(found: Sequence[Result]) -> Result:
         values = [getattr(each, name) for each in found]
         return fmean(values) if all(value is not None for value in values) else None
 
-    return Result("", found[0].values, mean("psnr"), mean("ssim"), mean("seconds"), mean("megabytes"), f"{len(found)} scenes")
+    return Result("", found[0].values, **{name: mean(name) for name in FIGURES}, state=f"{len(found)} scenes")
 
 
 def _series(found: Sequence[Result], means: Sequence[Result], settings: Sequence[str], cost: str) -> dict[str, list[tuple[float, float, str]]]:
@@ -134,12 +137,7 @@ def _table(title: str, rows: Sequence[Result]) -> dict[str, Any]:
 
 
 def _row(each: Result, at_time: bool, at_size: bool) -> dict[str, Any]:
-    figures = [
-        "" if each.psnr is None else f"{each.psnr:.2f}",
-        "" if each.ssim is None else f"{each.ssim:.3f}",
-        "" if each.seconds is None else duration(each.seconds),
-        "" if each.megabytes is None else f"{each.megabytes:.2f}",
-    ]
+    figures = ["" if (value := getattr(each, name)) is None else shown(value) for name, shown in FIGURES.items()]
     link = None if each.run is None else f"{quote(each.run)}/{REPORT}"
     values = [value_text(value) for value in each.values]
     return {"settings": values, "figures": figures, "best_at_time": at_time, "best_at_size": at_size, "link": link, "state": each.state}
