@@ -23,21 +23,15 @@ def seeds() -> list[bytes]:
 def changed(rng: Random, data: bytes) -> bytes:
     """A change of the tensors, the metadata or the file, the digests put right in most."""
     found = safetensors_bytes.with_metadata(rng, data, "nerftree") if rng.random() < 0.35 else safetensors_bytes.changed(rng, data)
-    return found if rng.random() < 0.15 else with_digests(found)
+    return found if rng.random() < 0.15 else safetensors_bytes.restated(found, with_digests)
 
 
-def with_digests(data: bytes) -> bytes:
-    found = safetensors_bytes.parts(data)
-    if found is None:
-        return data
-    header, body = found
-    with suppress(Exception):
-        about = json.loads(header["__metadata__"]["nerftree"])
-        for name in about["sha256"]:
-            begin, end = header[name]["data_offsets"]
-            about["sha256"][name] = hashlib.sha256(body[begin:end]).hexdigest()
-        return safetensors_bytes.joined({**header, "__metadata__": {"nerftree": json.dumps(about)}}, body)
-    return data
+def with_digests(header: dict[str, Any], body: bytes) -> dict[str, str]:
+    about = json.loads(header["__metadata__"]["nerftree"])
+    for name in about["sha256"]:
+        begin, end = header[name]["data_offsets"]
+        about["sha256"][name] = hashlib.sha256(body[begin:end]).hexdigest()
+    return {"nerftree": json.dumps(about)}
 
 
 def use(tree: Any) -> None:

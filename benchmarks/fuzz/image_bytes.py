@@ -13,6 +13,8 @@ from benchmarks.fuzz.binary import LARGEST, changed_bytes, number
 
 SIZE = (32, 24)  # as tests/stages/captures.py
 EXIF_HEAD = b"Exif\0\0"
+_TAGS = (256, 257, 258, 259, 262, 273, 274, 277, 278, 279, 282, 284, 317, 320, 322, 323, 338, 339, 34665, 34853, 0, 65535)  # of TIFF
+_CHUNKS = (b"eXIf", b"tRNS", b"PLTE", b"iCCP", b"gAMA", b"acTL", b"fcTL", b"fdAT", b"IDAT")  # of PNG
 _LENGTHS = [0, 1, 4, 2**16, 2**31 - 1, 2**31, 2**32 - 1]
 
 
@@ -106,12 +108,7 @@ def tiff_changed(rng: Random, data: bytes) -> bytes:
             continue
         place = rng.randrange(4)
         if place == 0:
-            struct.pack_into(
-                order + "H",
-                out,
-                entry,
-                rng.choice((256, 257, 258, 259, 262, 273, 274, 277, 278, 279, 282, 284, 317, 320, 322, 323, 338, 339, 34665, 34853, 0, 65535)),
-            )
+            struct.pack_into(order + "H", out, entry, rng.choice(_TAGS))
         elif place == 1:
             struct.pack_into(order + "H", out, entry + 2, rng.choice((0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 16, 65535)))
         elif place == 2:
@@ -168,20 +165,10 @@ def png_changed(rng: Random, data: bytes) -> bytes:
         elif what == 4:
             chunks.insert(at, chunks[rng.randrange(len(chunks))])
         elif what == 5:
-            chunks.insert(
-                rng.randrange(len(chunks) + 1),
-                (rng.choice((b"eXIf", b"tRNS", b"PLTE", b"iCCP", b"gAMA", b"acTL", b"fcTL", b"fdAT", b"IDAT")), _exif_changed(rng, exif_block())),
-            )
+            chunks.insert(rng.randrange(len(chunks) + 1), (rng.choice(_CHUNKS), _exif_changed(rng, exif_block())))
         elif what == 6:
-            text = rng.choice(
-                (
-                    b"Raw profile type exif\0\0" + zlib.compress(b"\nexif\n      20\n4949"),
-                    b"a\0b",
-                    b"\0" * 5,
-                    b"x\0\0" + zlib.compress(b"0" * 2_000_000),
-                    b"k\0\1\0en\0\0" + zlib.compress(b"v"),
-                )
-            )
+            profile, large = b"Raw profile type exif\0\0" + zlib.compress(b"\nexif\n      20\n4949"), b"x\0\0" + zlib.compress(b"0" * 2_000_000)
+            text = rng.choice((profile, b"a\0b", b"\0" * 5, large, b"k\0\1\0en\0\0" + zlib.compress(b"v")))
             chunks.insert(max(1, len(chunks) - 1), (rng.choice((b"tEXt", b"zTXt", b"iTXt")), text))
         else:
             head = bytearray(chunks[0][1])

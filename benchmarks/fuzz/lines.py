@@ -7,24 +7,9 @@ from benchmarks.fuzz.values import NUMBERS, TEXTS
 
 _TOKENS = b"0123456789-.eE+# \n\r\tnaif"
 _WORDS = [
-    "nan",
-    "inf",
-    "-inf",
-    "NaN",
-    "Infinity",
-    "1e999",
-    "0x10",
-    "1_000",
-    "#",
-    "# Number of images: 7",
-    "# Number of points: 99999999999999999999",
-    "-",
-    "--1",
-    "²",
-    "١",
-    "1e400",
-    "-" * 30 + "1",
-]
+    "nan", "inf", "-inf", "NaN", "Infinity", "1e999", "0x10", "1_000", "#", "# Number of images: 7", "# Number of points: 99999999999999999999", "-", "--1",
+    "²", "١", "1e400", "-" * 30 + "1",
+]  # fmt: skip
 
 
 def word(rng: Random) -> bytes:

@@ -83,19 +83,8 @@ def mask_seeds() -> list[bytes]:
 
     made = []
     pixels = np.random.default_rng(1).integers(0, 2, (captures.HEIGHT, captures.WIDTH), np.uint8) * 255
-    for mode, kind in (
-        ("L", "PNG"),
-        ("1", "PNG"),
-        ("RGB", "PNG"),
-        ("RGBA", "PNG"),
-        ("P", "PNG"),
-        ("I;16", "PNG"),
-        ("L", "JPEG"),
-        ("L", "TIFF"),
-        ("F", "TIFF"),
-        ("LA", "PNG"),
-        ("I", "TIFF"),
-    ):
+    kinds = [("L", "PNG"), ("1", "PNG"), ("RGB", "PNG"), ("RGBA", "PNG"), ("P", "PNG"), ("I;16", "PNG"), ("L", "JPEG"), ("L", "TIFF"), ("F", "TIFF")]
+    for mode, kind in (*kinds, ("LA", "PNG"), ("I", "TIFF")):
         out = io.BytesIO()
         base = Image.fromarray(pixels)
         (Image.fromarray(pixels.astype(np.uint16) * 257) if mode == "I;16" else base.convert(mode)).save(out, kind)
@@ -104,23 +93,9 @@ def mask_seeds() -> list[bytes]:
 
 
 READERS = (
-    Reader(
-        "images",
-        "photographs with EXIF: JPEG, PNG, TIFF, WEBP, BMP, HEIF, others under a wrong name",
-        image_bytes.seeds,
-        image_bytes.changed,
-        opened,
-        ("UnreadableImage",),
-        every=200,
-    ),
-    Reader(
-        "posed_images",
-        "an image of a posed data set",
-        image_bytes.seeds,
-        image_bytes.changed,
-        open_file(captures.nerfstudio, "images/img_0.png"),
-        every=100,
-        share=0.2,
-    ),
+    Reader("images", "photographs with EXIF: JPEG, PNG, TIFF, WEBP, BMP, HEIF, others under a wrong name", image_bytes.seeds, image_bytes.changed, opened,
+           ("UnreadableImage",), every=200),
+    Reader("posed_images", "an image of a posed data set", image_bytes.seeds, image_bytes.changed, open_file(captures.nerfstudio, "images/img_0.png"),
+           every=100, share=0.2),
     Reader("masks", "masks of photographs", mask_seeds, image_bytes.changed, open_mask, ("UnreadableImage", "PipelineError"), every=200),
-)
+)  # fmt: skip

@@ -196,15 +196,8 @@ def _page(run: Path) -> None:
 
 
 def _reports(name: str) -> Reader:
-    return Reader(
-        f"report_{name.split('/')[0]}",
-        f"{name} of a run",
-        seed_of(name),
-        json_text.changed,
-        opened(name, _page, ("report", "RUN"), ("inspect", "RUN"), ("inspect", "RUN", "--json")),
-        every=100,
-        share=1 / len(REPORTS),
-    )
+    read = opened(name, _page, ("report", "RUN"), ("inspect", "RUN"), ("inspect", "RUN", "--json"))
+    return Reader(f"report_{name.split('/')[0]}", f"{name} of a run", seed_of(name), json_text.changed, read, every=100, share=1 / len(REPORTS))
 
 
 _STATUS = (("status", "RUN"), ("status", "RUN", "--json"))

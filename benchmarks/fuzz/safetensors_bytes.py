@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+from collections.abc import Callable
 from random import Random
 from typing import Any
 
@@ -68,6 +69,16 @@ def _reshaped(rng: Random, header: dict[str, Any]) -> dict[str, Any]:
     else:
         return {key: value for key, value in header.items() if key != name}
     return {**header, name: entry}
+
+
+def restated(data: bytes, metadata: Callable[[dict[str, Any], bytes], dict[str, str]]) -> bytes:
+    """The file with the metadata that a function gives of its header and its data, such as with right digests; unchanged where it raises."""
+    found = parts(data)
+    if found is None:
+        return data
+    with contextlib.suppress(Exception):
+        return joined({**found[0], "__metadata__": metadata(*found)}, found[1])
+    return data
 
 
 def with_metadata(rng: Random, data: bytes, key: str) -> bytes:

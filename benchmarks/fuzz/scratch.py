@@ -63,14 +63,9 @@ def with_digest(data: bytes) -> bytes:
 
     from stages.io.field_file import digest_of
 
-    parts = safetensors_bytes.parts(data)
-    if parts is None:
-        return data
-    with contextlib.suppress(Exception):
-        about = json.loads(parts[0]["__metadata__"]["field"])
-        about["sha256"] = digest_of(load(data))
-        return safetensors_bytes.joined({**parts[0], "__metadata__": {"field": json.dumps(about)}}, parts[1])
-    return data
+    return safetensors_bytes.restated(
+        data, lambda header, body: {"field": json.dumps({**json.loads(header["__metadata__"]["field"]), "sha256": digest_of(load(data))})}
+    )
 
 
 def open_checkpoint(folder: Path) -> Opened:
@@ -261,12 +256,7 @@ def refinement_changed(rng: Random, data: bytes) -> bytes:
     from stages.bake.refine.checkpoint import digest_of
 
     found = safetensors_bytes.changed(rng, data)
-    parts = safetensors_bytes.parts(found)
-    if rng.random() < 0.15 or parts is None:
-        return found
-    with contextlib.suppress(Exception):
-        return safetensors_bytes.joined({**parts[0], "__metadata__": {"sha256": digest_of(load(found))}}, parts[1])
-    return found
+    return found if rng.random() < 0.15 else safetensors_bytes.restated(found, lambda header, body: {"sha256": digest_of(load(found))})
 
 
 def open_refinement(folder: Path) -> Opened:

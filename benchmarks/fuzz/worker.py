@@ -32,6 +32,22 @@ KEPT = 200  # inputs that are changed again, as the seeds are
 INSTRUMENTED = ["pipeline", "stages.io", "stages.formats", "stages.train", "workflows.cli", "workflows.report", "workflows.inspection"]
 
 
+def shrunk(data: bytes, fails: Callable[[bytes], bool], seconds: float) -> bytes:
+    """The input without runs of bytes, longer ones first, for as long as it still fails; for at most so many seconds."""
+    end = time.monotonic() + seconds
+    size = max(len(data) // 2, 1)
+    while size and time.monotonic() < end:
+        at = 0
+        while at < len(data) and time.monotonic() < end:
+            candidate = data[:at] + data[at + size :]
+            if fails(candidate):
+                data = candidate
+            else:
+                at += size
+        size //= 2
+    return data
+
+
 class Tally:
     """What became of the inputs of one process."""
 
@@ -85,8 +101,6 @@ class Tally:
 
     def shrink(self, seconds: float) -> None:
         """Make the inputs of the findings smaller."""
-        from benchmarks.fuzz.shrinking import shrunk
-
         for found in self.findings.values():
             if found["by"].startswith("Hang") or found["command"] is not None:
                 continue
@@ -151,16 +165,8 @@ def guided(tally: Tally, seed: int, count: int, finish: Callable[[], None]) -> N
         base = bytes(data) if rng.random() < 0.6 else rng.choice(seeds)  # the valid files are near what is accepted
         return changed(tally.reader, rng, base)[:largest]
 
-    options = [
-        f"-seed={seed % 2**31 + 1}",
-        "-timeout=0",
-        "-rss_limit_mb=0",
-        "-max_len=1048576",
-        "-len_control=0",
-        "-mutate_depth=2",
-        "-verbosity=0",
-        "-reload=0",
-    ]
+    options = [f"-seed={seed % 2**31 + 1}"]
+    options += ["-timeout=0", "-rss_limit_mb=0", "-max_len=1048576", "-len_control=0", "-mutate_depth=2", "-verbosity=0", "-reload=0"]
     atheris.Setup([sys.argv[0], *options, str(corpus)], try_one, custom_mutator=next_input)
     atheris.Fuzz()
 
