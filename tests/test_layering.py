@@ -39,7 +39,7 @@ MANY_ARGUMENTS = {
 HEAVY = ("torch", "pycolmap", "cv2", "numba", "matplotlib")
 DOOR = (
     "stages.artifacts", "efficientnerf.settings", "efficientnerf.training.settings", "workflows.asset", "workflows.budget", "workflows.cli.main",
-    "workflows.cli.run", "workflows.cli.status", "workflows.cli.verify", "workflows.cli.presets", "workflows.fleet.program", "stages.sfm.pair_workers",
+    "workflows.cli.run", "workflows.inspection.status", "workflows.cli.verify", "workflows.cli.presets", "workflows.fleet.program", "stages.sfm.pair_workers",
 )  # fmt: skip
 # Imports within functions, each with its reason beside it: of extras, of Triton, of pycolmap, which other libraries must precede, of what most runs need not.
 LATE = {

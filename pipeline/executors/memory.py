@@ -18,8 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import UsageError
-from pipeline.executors.cgroups import cgroup_folders, first_number
-from pipeline.executors.cores import affinity
+from pipeline.executors.cores import affinity, cgroup_folders, first_number
 from pipeline.text import printable
 
 UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}

@@ -19,12 +19,11 @@ from workflows.cli.output import closing, conclude, listing, write_json
 from workflows.cli.progress import duration, size
 from workflows.cli.resolve import read_preset, read_toml
 from workflows.fleet.checked import Choice, refuse_what_cannot_work, table_of_options
-from workflows.fleet.display import display
+from workflows.fleet.display import BAD_GRADES, display, overview
 from workflows.fleet.manifest import read_manifest
 from workflows.fleet.pages.index import quality_of
 from workflows.fleet.running import Placement, check_fleet_folder, check_known, is_running, run_fleet, scenes_to_retry
 from workflows.fleet.sweeps import read_sweeps, swept
-from workflows.fleet.table import BAD_GRADES, overview
 
 CLUSTERS = ("local", "ssh", "slurm", "pbs", "lsf", "sge", "htcondor", "oar")  # of pipeline/executors/dask.py, which --help does not import
 

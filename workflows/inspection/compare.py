@@ -1,18 +1,41 @@
-"""Comparison of two assets: metadata, tensors and renders."""
+"""`enerf diff`: two assets compared, their metadata, tensors and renders."""
 
 import json
 from pathlib import Path
 from typing import Any
+
+import click
 
 from efficientnerf.asset.camera_paths import turntable_cameras
 from efficientnerf.asset.format import contents
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.evaluation.metrics import psnr
+from workflows.cli.options import folder_type, output_options
+from workflows.cli.output import conclude, listing
 from workflows.cli.target import asset_of
 from workflows.loading import load_asset
 
+DIFFERENT = 6  # exit code; 1 would be that of a defect
 PSNR_CAP = 100.0  # decibels: JSON has no infinity; equal renders get this
+
+
+@click.command()
+@click.argument("first", metavar="A", type=folder_type)
+@click.argument("second", metavar="B", type=folder_type)
+@click.option("--views", type=click.IntRange(0, 1000), default=4, show_default=True, help="Number of renders to compare, on an orbit of A.")
+@click.option("--size", type=click.IntRange(16, 4096), default=400, show_default=True, help="Side of the renders in pixels.")
+@output_options
+def diff(first: Path, second: Path, views: int, size: int, as_json: bool, quiet: bool) -> int:
+    """Compare the assets (or runs) A and B: metadata and tensors that differ, and the PSNR between their renders.
+
+    The exit code is 0 if they are equal, 6 if they differ, 4 if one is damaged.
+    """
+    found = compare(first, second, views, size)
+    code = 0 if found["equal"] else DIFFERENT
+    if not as_json and not quiet:
+        listing(*in_words(found))
+    return conclude(as_json=as_json, quiet=True, code=code, ok=True, first=str(first), second=str(second), **found)
 
 
 def compare(first: Path, second: Path, views: int, size: int) -> dict[str, Any]:

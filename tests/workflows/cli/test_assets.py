@@ -11,7 +11,7 @@ from efficientnerf.asset.file import memory
 from efficientnerf.asset.format import WRITERS, describe, load, save
 from tests.efficientnerf.trees import random_tree
 from tests.workflows.command import Enerf, Result
-from workflows.cli.assets import LAYOUTS
+from workflows.inspection.convert import LAYOUTS
 
 ROOT = Path(__file__).resolve().parents[3]
 

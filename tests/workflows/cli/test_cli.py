@@ -245,7 +245,7 @@ def test_interrupted_runs_say_how_to_go_on(toys: Path, tmp_path: Path, number: i
 
 def test_a_second_ctrl_c_at_the_end_prints_no_traceback(tmp_path: Path) -> None:
     program = (
-        "import atexit, os, signal, sys, time; from workflows.cli import main, status\n"
+        "import atexit, os, signal, sys, time; from workflows.cli import main; from workflows.inspection import status\n"
         "def interrupted(*_, **__): raise KeyboardInterrupt\n"
         "status.status.callback = interrupted\n"
         "atexit.register(lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep(5)))\n"

@@ -17,7 +17,7 @@ from tests.efficientnerf.trees import random_tree
 from tests.stages.viewer.browser import Page, missing, opened
 from tests.workflows.viewing.growing import TRAIN, put, scratch
 from workflows.viewing.server import LOOPBACK, Server
-from workflows.viewing.sites import RunSite, asset_site
+from workflows.viewing.serving import RunSite, asset_site
 
 pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
 

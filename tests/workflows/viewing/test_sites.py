@@ -19,9 +19,9 @@ from tests.workflows.report.records import record, record_splats
 from tests.workflows.viewing.growing import PNG, TRAIN, put, scratch
 from workflows.report.signature import write_page
 from workflows.report.viewer import is_newest
-from workflows.viewing import progress, sites
+from workflows.viewing import progress, serving
 from workflows.viewing.server import Answer
-from workflows.viewing.sites import RunSite, asset_site, make_page
+from workflows.viewing.serving import RunSite, asset_site, make_page
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ HOSTILE = ["/previews/train/../../run.json", "/previews/train/%2e%2e/run.json", 
            "/previews/../preview_000001.png", "/previews/train/preview_000001.png/", "/previews/train/preview_000001.png?x", "/previews/train/preview_1.png",
            "/previews/train/", "/previews/train/preview_000001.PNG", "/previews/train/preview_000001.png%00", "/previews/train/preview_000001.png\n",
            "/previews/bake/preview_000001.png", "/previews/poses/preview_000001.png", "/run.json", "/.lock", "/train/log.jsonl", "/.work/", "//status.json",
-           "/live.html", "/../live.js", "/sites.py", "/status.json/", "/STATUS.JSON", "", "status.json", "/previews/train/preview_٠٠٠٠٠١.png"]  # fmt: skip
+           "/live.html", "/../live.js", "/serving.py", "/status.json/", "/STATUS.JSON", "", "status.json", "/previews/train/preview_٠٠٠٠٠١.png"]  # fmt: skip
 
 
 def test_no_other_path_leads_anywhere(run: Run, tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def test_the_viewer_comes_with_the_asset_and_changes_with_it(run: Run, tmp_path:
         made.append(what.name)
         target.write_text(f"page {len(made)}", encoding="utf-8")
 
-    monkeypatch.setattr(sites, "make_page", make)
+    monkeypatch.setattr(serving, "make_page", make)
     monkeypatch.setattr(progress, "PAUSE", 0.0)
     monkeypatch.setattr(progress, "SHARE", 1e9)
     site = site_of(run, tmp_path)

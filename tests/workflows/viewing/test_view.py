@@ -19,7 +19,7 @@ from stages.artifacts import BakeOutputs
 from tests.workflows.assets import write_block
 from tests.workflows.command import Enerf
 from workflows.report.signature import write_page
-from workflows.viewing import serving, sites
+from workflows.viewing import serving
 
 
 @pytest.fixture
@@ -34,8 +34,7 @@ def opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
     def make(what: Path, asset: Path, target: Path) -> None:
         write_page(target, f"{what.name} of {asset.stat().st_size} bytes".encode())
 
-    for module in (serving, sites):
-        monkeypatch.setattr(module, "make_page", make)
+    monkeypatch.setattr(serving, "make_page", make)
     return shown
 
 
@@ -128,7 +127,7 @@ def test_a_run_is_served_until_a_signal(enerf: Enerf, run: Path, opened: list[st
         yield asked
 
     monkeypatch.setattr(serving, "stopping", stopping)
-    monkeypatch.setattr("workflows.cli.assets.write_json", lambda value, **_: urls.append(value["url"]) if "url" in value else None)
+    monkeypatch.setattr("workflows.viewing.serving.write_json", lambda value, **_: urls.append(value["url"]) if "url" in value else None)
     assert enerf("view", run, "--serve", 0, "--json", *more).code == 0
     assert b"/live.js" in answers[""]
     assert json.loads(answers["status.json"])["name"] == "run"
