@@ -26,8 +26,6 @@ CONFIG_OPTIONS = {"preset": str, "device": str, "seed": int}
 MAX_TOML = 2**16  # bytes; all settings together are a tenth of it
 MAX_SHOWN = 200  # characters of a value in a message
 _MAX_DOTS = 1000  # on a line: tomllib takes memory by the square of a key's parts
-_MAX_DEPTH = 8  # of a setting's value
-_LARGEST = 2**63
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,7 @@ def read_config(path: Path) -> Config:
     for name, value in options.items():
         if type(value) is not CONFIG_OPTIONS[name]:
             expected = "a whole number" if CONFIG_OPTIONS[name] is int else "text"
-            raise UsageError(f"--config {path}: {name}: found {printable(_text_of(value), MAX_SHOWN)}, expected {expected}.")
+            raise UsageError(f"--config {path}: {name}: found {_text_of(value)}, expected {expected}.")
     for name, value in content.items():
         if not isinstance(value, dict):
             raise UnknownSetting(
@@ -141,19 +139,12 @@ def parse_toml(text: str, limit: int = MAX_TOML) -> dict[str, Any]:
         raise ValueError("nested too deeply") from None
 
 
-def _is_plain(value: Any, depth: int = 0) -> bool:
-    """Whether a value is small enough to be a setting's: bounded numbers, bounded depth."""
-    if isinstance(value, int):
-        return -_LARGEST <= value < _LARGEST
-    if isinstance(value, (list, tuple, dict)):
-        items = value.values() if isinstance(value, dict) else value
-        return depth < _MAX_DEPTH and all(_is_plain(item, depth + 1) for item in items)
-    return True
-
-
 def _text_of(value: Any) -> str:
     """A value as a message shows it; Python writes out no number of more than 4300 digits, and nothing that nests deeply."""
-    return repr(value) if _is_plain(value) else "a number beyond 64 bits, or a deep list"
+    try:
+        return printable(repr(value), MAX_SHOWN)
+    except (ValueError, RecursionError):
+        return "a value that is too long"
 
 
 def parse_value(text: str) -> list[Any]:
@@ -214,8 +205,6 @@ class Settings:
         refused = None
         for reading in readings:
             try:
-                if not _is_plain(reading):
-                    raise UsageError(f"{stage}.{name}: holds a whole number beyond 64 bits, or nests too deeply.")
                 checked: Any = settings_from(self.types[stage], {name: reading}, where=stage)
                 self.values[stage][name] = getattr(checked, name)
                 return
@@ -259,7 +248,7 @@ class Settings:
         """Set `seed` in every stage that has it."""
         for stage, entries in self.about.items():
             if "seed" in entries:
-                self.put(stage, "seed", [seed], f"--seed {printable(_text_of(seed), MAX_SHOWN)}")
+                self.put(stage, "seed", [seed], f"--seed {_text_of(seed)}")
 
     def resolved(self) -> dict[str, Any]:
         """{stage: an instance of its settings dataclass}."""

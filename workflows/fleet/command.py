@@ -8,6 +8,7 @@ import click
 import msgspec
 
 from pipeline.errors import BadInput, UsageError
+from pipeline.executors.dask import CLUSTERS
 from pipeline.fleet import requests
 from pipeline.fleet.state import FleetState, SceneState, read_fleet
 from pipeline.locks.lock import holder_of
@@ -24,8 +25,6 @@ from workflows.fleet.manifest import read_manifest
 from workflows.fleet.pages.index import quality_of
 from workflows.fleet.running import Placement, check_fleet_folder, check_known, is_running, run_fleet, scenes_to_retry
 from workflows.fleet.sweeps import read_sweeps, swept
-
-CLUSTERS = ("local", "ssh", "slurm", "pbs", "lsf", "sge", "htcondor", "oar")  # of pipeline/executors/dask.py, which --help does not import
 
 
 class _Fleet(click.Group):
@@ -57,7 +56,7 @@ def _placement_options(command: Any) -> Any:
         click.option("--jobs", type=click.IntRange(1, 1024), default=1, metavar="N",
                      help="Number of concurrent CPU stages per worker, which share its cores and memory; each CUDA device runs one more. By default 1."),
         click.option("--scheduler", metavar="ADDRESS", help="Use the workers of this Dask scheduler, such as tcp://host:8786."),
-        click.option("--cluster", type=click.Choice(CLUSTERS), help="Start a Dask cluster: local processes, over ssh, or jobs of a batch queue."),
+        click.option("--cluster", type=click.Choice(list(CLUSTERS)), help="Start a Dask cluster: local processes, over ssh, or jobs of a batch queue."),
         click.option("--cluster-options", type=folder_type, metavar="FILE", help="TOML file with options of the cluster."),
         device_option,
         memory_option,

@@ -102,7 +102,7 @@ def _mean(found: Sequence[Result]) -> Result:
         values = [getattr(each, name) for each in found]
         return fmean(values) if all(value is not None for value in values) else None
 
-    return Result("", found[0].values, **{name: mean(name) for name in FIGURES}, state=f"{len(found)} scenes")
+    return Result("", found[0].values, mean("psnr"), mean("ssim"), mean("seconds"), mean("megabytes"), f"{len(found)} scenes")
 
 
 def _series(found: Sequence[Result], means: Sequence[Result], settings: Sequence[str], cost: str) -> dict[str, list[tuple[float, float, str]]]:
