@@ -153,7 +153,7 @@ class _Runner:
         side_by_side, left, begun = self.side_by_side, list(waiting), dict[Future[Outcome], Stage]()
         memory = None if self.memory is None else Limit(self.memory.bytes // side_by_side.jobs, self.memory.whose)
         with ThreadPoolExecutor(side_by_side.jobs, thread_name_prefix="stage") as pool:
-            pending, new, asked = set[Future[Outcome]](), _ready(left), False
+            pending, new = set[Future[Outcome]](), _ready(left)
             while new or pending:
                 submitted = {pool.submit(self.one, stage, stage.name in forced, side_by_side.execute, memory): stage for stage in new}
                 begun |= submitted
@@ -165,9 +165,8 @@ class _Runner:
                 if stop or any(future.cancelled() or future.exception() is not None for future in ended):
                     pool.shutdown(wait=False, cancel_futures=True)
                     left = []
-                if stop and not asked:
-                    asked = True
-                    side_by_side.stop()
+                if stop:
+                    side_by_side.stop()  # a child heeds the first
                 left = [stage for stage in left if stage.name not in {begun[future].name for future in ended}]
                 free = [stage for stage in _ready(left) if stage.name not in {each.name for each in begun.values()}] if ended and pending else []
                 new = [stage for stage in free if self._have_memory([stage])]

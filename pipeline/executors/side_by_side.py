@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import queue
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +10,8 @@ from pipeline import errors
 from pipeline.executors.child import Children
 from pipeline.executors.local import Usage
 from pipeline.stage import Job, Stage, settings_dict
+
+RUN = "stages side by side"  # that all children work for
 
 
 class FailureInChild(Exception):
@@ -29,10 +30,6 @@ class SideBySide:
 
     def __post_init__(self) -> None:
         self._children = Children(self.module, self.jobs)
-        self._names = [f"stages side by side {number}" for number in range(self.jobs)]
-        self._free: queue.SimpleQueue[str] = queue.SimpleQueue()
-        for name in self._names:
-            self._free.put(name)
 
     def __enter__(self) -> SideBySide:
         return self
@@ -51,11 +48,7 @@ class SideBySide:
             "device": job.device,
             "memory": None if job.memory is None else [job.memory.bytes, job.memory.whose],
         }
-        name = self._free.get()
-        try:
-            answer = self._children.work({"kind": "job", "run": name, "stage": stage.name, "job": facts}, job.pass_on, cores=self.cores)
-        finally:
-            self._free.put(name)
+        answer = self._children.work({"kind": "job", "run": RUN, "stage": stage.name, "job": facts}, job.pass_on, cores=self.cores)
         if not answer["ok"]:
             raise _error_of(stage.name, answer)
         job.facts |= answer["facts"]
@@ -67,8 +60,7 @@ class SideBySide:
 
     def stop(self) -> None:
         """Ask all stages that run to stop at their next safe points."""
-        for name in self._names:
-            self._children.stop(name)
+        self._children.stop(RUN)
 
 
 def _error_of(stage: str, answer: dict[str, Any]) -> errors.PipelineError:
