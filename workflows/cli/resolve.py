@@ -95,7 +95,7 @@ def read_config(path: Path) -> Config:
     for name, value in options.items():
         if type(value) is not CONFIG_OPTIONS[name]:
             expected = "a whole number" if CONFIG_OPTIONS[name] is int else "text"
-            raise UsageError(f"--config {path}: {name}: found {_text_of(value)}, expected {expected}.")
+            raise UsageError(f"--config {path}: {name}: found {text_of(value)}, expected {expected}.")
     for name, value in content.items():
         if not isinstance(value, dict):
             raise UnknownSetting(
@@ -139,10 +139,10 @@ def parse_toml(text: str, limit: int = MAX_TOML) -> dict[str, Any]:
         raise ValueError("nested too deeply") from None
 
 
-def _text_of(value: Any) -> str:
+def text_of(value: Any, limit: int = MAX_SHOWN) -> str:
     """A value as a message shows it; Python writes out no number of more than 4300 digits, and nothing that nests deeply."""
     try:
-        return printable(repr(value), MAX_SHOWN)
+        return printable(repr(value), limit)
     except (ValueError, RecursionError):
         return "a value that is too long"
 
@@ -248,7 +248,7 @@ class Settings:
         """Set `seed` in every stage that has it."""
         for stage, entries in self.about.items():
             if "seed" in entries:
-                self.put(stage, "seed", [seed], f"--seed {_text_of(seed)}")
+                self.put(stage, "seed", [seed], f"--seed {text_of(seed)}")
 
     def resolved(self) -> dict[str, Any]:
         """{stage: an instance of its settings dataclass}."""

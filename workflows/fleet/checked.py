@@ -15,7 +15,7 @@ from pipeline.run import NAME as RUN_NAME
 from pipeline.stage import Stage, plain, settings_from, settings_of
 from pipeline.text import printable
 from workflows.budget import share_budget, train_share
-from workflows.cli.resolve import Settings, merged, nearest, parse_value, read_preset, seconds_of
+from workflows.cli.resolve import Settings, merged, nearest, parse_value, read_preset, seconds_of, text_of
 from workflows.workflow import Workflow
 
 Table = dict[str, dict[str, Any]]
@@ -63,7 +63,6 @@ class Checker:
         self.what = what
         self.mistakes: list[tuple[int, str]] = []
         self._settings = Settings(workflow.settings)
-        self._known: dict[tuple[str, str, str], Any] = {}
 
     def mistake(self, text: str, *, line: int | None = None, scene: str | None = None) -> None:
         """Keep a mistake; `text` says what was found and what was expected."""
@@ -89,13 +88,10 @@ class Checker:
 
     def value(self, stage: str, name: str, value: Any, *, by_hand: bool = False) -> Any:
         """A setting's value as JSON holds it, of a manifest or, `by_hand`, of the command line. Raises UsageError."""
-        key = (stage, name, f"{type(value).__name__} {value!r}")
-        if key not in self._known:
-            if f"{stage}.{name}" in GIVEN_BY_HAND and not by_hand:
-                raise UsageError(f"{stage}.{name}: found in a manifest, expected on the command line alone (--set {stage}.{name}=VALUE).")
-            self._settings.put(stage, name, parse_value(str(value).strip()) if isinstance(value, Text) else [value], "")
-            self._known[key] = plain(self._settings.values[stage][name])
-        return self._known[key]
+        if f"{stage}.{name}" in GIVEN_BY_HAND and not by_hand:
+            raise UsageError(f"{stage}.{name}: found in a manifest, expected on the command line alone (--set {stage}.{name}=VALUE).")
+        self._settings.put(stage, name, parse_value(str(value).strip()) if isinstance(value, Text) else [value], "")
+        return plain(self._settings.values[stage][name])
 
     def given(self, table: Mapping[str, Mapping[str, Any]], seed: int | None = None) -> Table:
         """Settings of the command line, whose values may be Text, as JSON holds them. Raises UsageError, for a seed that no stage takes, too."""
@@ -136,10 +132,10 @@ class Checker:
             except ValueError:
                 found.seed = None
             if type(found.seed) is not int:
-                raise UsageError(f"seed: found {printable(repr(value), 100)}, expected a whole number.")
+                raise UsageError(f"seed: found {text_of(value, 100)}, expected a whole number.")
             self._settings.put_seed(found.seed)
         elif not isinstance(value, str):
-            raise UsageError(f"{name}: found {printable(repr(value), 100)}, expected text.")
+            raise UsageError(f"{name}: found {text_of(value, 100)}, expected text.")
         elif name == "preset":
             found.preset = read_preset(str(value), self.workflow.presets).name
         elif name == "as":

@@ -28,7 +28,7 @@ from pipeline.fleet.state import MOST_SCENES, Scene, is_scene_name
 from pipeline.run import MOST_SOURCES
 from pipeline.text import printable
 from stages.formats.importers.photographs import is_video
-from workflows.cli.resolve import parse_toml, read_text
+from workflows.cli.resolve import parse_toml, read_text, text_of
 from workflows.fleet.checked import OPTIONS, Checker, Choice, Text
 from workflows.fleet.folders import folder_entries, glob_entries, listed_entries
 from workflows.workflow import Workflow
@@ -96,7 +96,7 @@ def _toml(text: str, checker: Checker) -> tuple[Choice, list[Entry]]:
     entries = []
     for name, table in tables.items():
         if not isinstance(table, dict):
-            checker.mistake(f"found {printable(repr(table), 100)}, expected a table with source = ...", scene=name)
+            checker.mistake(f"found {text_of(table, 100)}, expected a table with source = ...", scene=name)
             continue
         stated = [table.pop(key) for key in ("source", "sources") if key in table]
         listed = [each if isinstance(each, list) else [each] for each in stated]
@@ -208,7 +208,7 @@ class _Reader:
     def _wrong(self, entry: Entry, source: Any) -> str | None:
         """What is wrong with a source, or None."""
         if not isinstance(source, str) or not source or "\0" in source or len(source) > 4096:
-            return f"source: found {printable(repr(source), 100)}, expected the path of a folder or of a video."
+            return f"source: found {text_of(source, 100)}, expected the path of a folder or of a video."
         path, shown = self.base / source, printable(source, 300)
         try:
             real = os.path.realpath(path)

@@ -209,6 +209,8 @@ HOSTILE = [
     b"[scenes.'index.html']\nsource = 'shoots/a'",
     b"[scenes.'a b']\nsource = 'shoots/a'",
     ONE + b"seed = " + b"9" * 5000,
+    *(ONE + key + b" = 0x" + b"f" * 6000 for key in (b"seed", b"preset", b"train.iterations")),  # Python writes out no number so long
+    b"[scenes]\na = 0x" + b"f" * 6000,
     ONE + b"train = []",
     ONE + b"x = " + b"[" * 5000,
     ONE + b"[scenes.a]",
@@ -221,7 +223,7 @@ HOSTILE = [
 TABLES = [b"", b"\0", b"scene,path\na,b\n", b"name,source\n" + b'"' * 9, b"name" + b",x" * 100_000, b"name,source\n" + b"x" * 200_000]
 
 
-@pytest.mark.parametrize(("name", "data"), [*(("fleet.toml", data) for data in HOSTILE), *(("fleet.csv", data) for data in TABLES)], ids=range(28))
+@pytest.mark.parametrize(("name", "data"), [*(("fleet.toml", data) for data in HOSTILE), *(("fleet.csv", data) for data in TABLES)], ids=range(32))
 def test_hostile_manifests_are_refused_in_words(place: Path, name: str, data: bytes) -> None:
     Path(name).write_bytes(data)
     with pytest.raises(PipelineError) as caught:
