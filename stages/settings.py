@@ -14,20 +14,14 @@ from pipeline.stage import hints_of, limits_of, type_in_words
 
 @dataclasses.dataclass(frozen=True)
 class SettingInfo:
-    """Description of a settings field.
-
-    type      its annotation, evaluated
-    choices   the words it may be, such as auto; all its values where `listed`
-    minimum   of its numbers, inclusive or exclusive; maximum likewise
-    advanced  whether it is listed apart from the settings that most users want
-    """
+    """Description of a settings field."""
 
     name: str
-    type: Any
+    type: Any  # its annotation, evaluated
     default: Any
     doc: str
     unit: str | None
-    advanced: bool
+    advanced: bool  # whether it is listed apart from the settings that most users want
 
     @property
     def type_name(self) -> str:
@@ -36,6 +30,7 @@ class SettingInfo:
 
     @property
     def choices(self) -> tuple[Any, ...] | None:
+        """The words it may be, such as auto; all its values where `listed`."""
         return tuple(choice for arm in _arms(self.type) if typing.get_origin(arm) is typing.Literal for choice in typing.get_args(arm)) or None
 
     @property
@@ -45,6 +40,7 @@ class SettingInfo:
 
     @property
     def minimum(self) -> float | None:
+        """Of its numbers, inclusive or exclusive, as `maximum`."""
         return next((low for arm in _arms(self.type) if (low := limits_of(arm)[0]) is not None), None)
 
     @property

@@ -39,59 +39,32 @@ def coarse_cells(grids: Sequence[Grid]) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Bake:
-    """
-    kind               see the module
-    space              the field's, in the frame that the voxels are cubes of
-    background         constant sRGB colour that the asset is composited with; None: its environment map
-    resolution         voxels along the longest side: those stated, or the most in question; of a scene an estimate until its foreground region is known
-    fixed              whether they are stated
-    least_cells, most_cells
-                       coarse cells of all grids, at the least resolution in question and at the greatest
-    at_centres         whether the field was trained on the centres of the innermost grid's voxels
-    min_views          training images that have a voxel in view at least, in contracted space; 0: any number
-    max_mib            of the file
-    mib                that voxels are chosen by
-    usual_mib          of both without bake.time_budget
-    timed              whether they follow from bake.time_budget
-    degree             of the harmonics
-    layout, brick_size, environment_size
-                       that the file has, the last in rows, 0 without an environment map
-    min_component      size below which components are dropped, over that of the largest one
-    refine_steps       stated; None: as many as usual for the voxels that there will be
-    seconds            of the stage, in place of steps; None: it may take any time
-    view_dependent_lr_ratio, error_map
-                       of the refinement
-    box                of a scene: (2, 3) that the innermost grid covers where the field was trained on voxels, whose corner is one of theirs; None: the
-                       foreground region's
-    cascades           of a scene: how many nested grids there are, at least and at most
-    max_resolution     stated; None: as many as MAX_CELLS of all grids allow
-    """
-
-    kind: Literal["object", "scene", "ndc"]
-    space: Space
-    background: tuple[float, float, float] | None
-    resolution: Choice
-    fixed: bool
-    least_cells: int
-    most_cells: int
-    at_centres: bool
-    min_views: int
-    max_mib: float
-    mib: float
-    usual_mib: float
-    timed: bool
-    degree: int
+    kind: Literal["object", "scene", "ndc"]  # see the module
+    space: Space  # the field's, in the frame that the voxels are cubes of
+    background: tuple[float, float, float] | None  # constant sRGB colour that the asset is composited with; None: its environment map
+    resolution: Choice  # voxels along the longest side: those stated, or the most in question; of a scene an estimate until its foreground region is known
+    fixed: bool  # whether they are stated
+    least_cells: int  # coarse cells of all grids, at the least resolution in question
+    most_cells: int  # and at the greatest
+    at_centres: bool  # whether the field was trained on the centres of the innermost grid's voxels
+    min_views: int  # training images that have a voxel in view at least, in contracted space; 0: any number
+    max_mib: float  # of the file
+    mib: float  # that voxels are chosen by
+    usual_mib: float  # of both without bake.time_budget
+    timed: bool  # whether they follow from bake.time_budget
+    degree: int  # of the harmonics
     layout: str
     brick_size: int
-    environment_size: int
-    min_component: float
-    refine_steps: int | None
-    seconds: float | None
-    view_dependent_lr_ratio: float
+    environment_size: int  # rows; 0 without an environment map
+    min_component: float  # size below which components are dropped, over that of the largest one
+    refine_steps: int | None  # stated; None: as many as usual for the voxels that there will be
+    seconds: float | None  # of the stage, in place of steps; None: it may take any time
+    view_dependent_lr_ratio: float  # of the refinement, as is the next
     error_map: float
+    # of a scene: (2, 3) that the innermost grid covers where the field was trained on voxels, whose corner is one of theirs; None: the foreground region's
     box: np.ndarray | None
-    cascades: tuple[int, int]
-    max_resolution: int | None
+    cascades: tuple[int, int]  # of a scene: how many nested grids there are, at least and at most
+    max_resolution: int | None  # stated; None: as many as MAX_CELLS of all grids allow
 
     @property
     def least(self) -> int:

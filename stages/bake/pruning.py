@@ -29,14 +29,10 @@ RAYS_PER_VOXEL = {"object": 1.0, "scene": 0.4, "ndc": 0.25}
 
 @dataclass(frozen=True)
 class Pruned:
-    """How voxels were dropped: of unbounded scenes, the shares of the rays that end in holes.
+    """How voxels were dropped: of unbounded scenes, the shares of the rays that end in holes."""
 
-    without   after voxels were dropped
-    restored  after `voxels` of them were restored
-    """
-
-    without: float = 0.0
-    restored: float = 0.0
+    without: float = 0.0  # after voxels were dropped
+    restored: float = 0.0  # after `voxels` of them were restored
     voxels: int = 0
 
     def report(self) -> dict[str, Any]:

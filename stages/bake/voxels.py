@@ -33,19 +33,13 @@ WELL_SEEN_VIEWS, FEW_VIEWS_RATIO = 4, 30.0  # of fewer than 7 training images ha
 
 @dataclass(frozen=True, eq=False)
 class Voxels:
-    """Voxels that are baked.
-
-    grids         nested, the innermost first; one unless the scene is unbounded
-    indices       coordinates (N, 3) of the voxels in each of them
-    bricks        coarse cells that hold a sample, of all grids
-    surroundings  of unbounded scenes alone
-    """
+    """Voxels that are baked."""
 
     choice: Choice
-    grids: list[Grid]
-    indices: list[np.ndarray]
-    bricks: int
-    surroundings: Surroundings | None = None
+    grids: list[Grid]  # nested, the innermost first; one unless the scene is unbounded
+    indices: list[np.ndarray]  # coordinates (N, 3) of the voxels in each of them
+    bricks: int  # coarse cells that hold a sample, of all grids
+    surroundings: Surroundings | None = None  # of unbounded scenes alone
 
     @property
     def count(self) -> int:

@@ -62,18 +62,12 @@ def boxes_of(grids: Sequence[Grid], brick: int) -> list[np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What only the asset of an unbounded scene has.
+    """What only the asset of an unbounded scene has."""
 
-    samples      what the field shows along training rays and past the borders of their images
-    region       the foreground
-    seen         for each grid (N, 2) what rays saw of its voxels (`efficientnerf.asset.field_samples.seen_weights`)
-    environment  (H, 2 H, 3) what lies beyond all grids
-    """
-
-    samples: FieldSamples
-    region: Region
-    seen: list[np.ndarray]
-    environment: np.ndarray
+    samples: FieldSamples  # what the field shows along training rays and past the borders of their images
+    region: Region  # the foreground
+    seen: list[np.ndarray]  # for each grid (N, 2) what rays saw of its voxels (`efficientnerf.asset.field_samples.seen_weights`)
+    environment: np.ndarray  # (H, 2 H, 3) what lies beyond all grids
 
 
 class Cascades:

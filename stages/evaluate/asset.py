@@ -20,21 +20,15 @@ OnRays = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # origins (
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedAsset:
-    """An asset to be measured.
+    """An asset to be measured."""
 
-    render   all of it, as `efficientnerf.asset.rendering.render`
-    inner    of an unbounded scene: cascade 0 alone; None: the scene is bounded, or forward-facing
-    box      (2, 3) of cascade 0; None: that of the field's space
-    reach    (2, 3) of all cascades; None: the same
-    limits, nearer  `surface_limits` and `opacity_nearer` of `efficientnerf.evaluation.surfaces`
-    """
-
-    render: RenderTree
+    render: RenderTree  # all of it, as `efficientnerf.asset.rendering.render`
+    # limits, nearer: `surface_limits` and `opacity_nearer` of `efficientnerf.evaluation.surfaces`
     limits: OnRays
     nearer: OnRays
-    inner: RenderTree | None = None
-    box: np.ndarray | None = None
-    reach: np.ndarray | None = None
+    inner: RenderTree | None = None  # of an unbounded scene: cascade 0 alone; None: the scene is bounded, or forward-facing
+    box: np.ndarray | None = None  # (2, 3) of cascade 0; None: that of the field's space
+    reach: np.ndarray | None = None  # (2, 3) of all cascades; None: the same
 
 
 def evaluated(tree: NerfTree) -> EvaluatedAsset:

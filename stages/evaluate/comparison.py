@@ -49,22 +49,16 @@ SAMPLE_SHARES = ("valid_share", "pivotal_share", "fine_per_ray")
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What is measured on the views of a scene.
-
-    splats      None: the run has none of the whole scene
-    points      that the asset's depth is compared with; None: there are none
-    taken       `stages.train.averaged.as_taken`
-    perceptual  LPIPS networks by the name of their metric
-    """
+    """What is measured on the views of a scene."""
 
     job: Job
     scene: Scene
     asset: EvaluatedAsset
     mesh: EvaluatedMesh
-    splats: EvaluatedSplats | None
-    points: ReliablePoints | None
-    taken: Taken | None
-    perceptual: Mapping[str, Lpips]
+    splats: EvaluatedSplats | None  # None: the run has none of the whole scene
+    points: ReliablePoints | None  # that the asset's depth is compared with; None: there are none
+    taken: Taken | None  # `stages.train.averaged.as_taken`
+    perceptual: Mapping[str, Lpips]  # LPIPS networks by the name of their metric
 
     @property
     def background(self) -> tuple[float, float, float] | None:

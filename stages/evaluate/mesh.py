@@ -34,16 +34,11 @@ MARGIN = 0.03  # of the depth, that surroundings have to be nearer to hide the m
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedMesh:
-    """A mesh to be measured.
+    """A mesh to be measured."""
 
-    shader        of the mesh in the training frame
-    surroundings  what of the asset is not in it, as `EvaluatedAsset.render`; None: nothing
-    facts         that metrics.json repeats
-    """
-
-    shader: Shader
-    surroundings: RenderTree | None
-    facts: dict[str, Any]
+    shader: Shader  # of the mesh in the training frame
+    surroundings: RenderTree | None  # what of the asset is not in it, as `EvaluatedAsset.render`; None: nothing
+    facts: dict[str, Any]  # that metrics.json repeats
 
 
 def evaluated_mesh(mesh: Mesh, surroundings: RenderTree | None) -> EvaluatedMesh:

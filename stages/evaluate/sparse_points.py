@@ -30,18 +30,12 @@ DOT = 2  # px, radius of a point in the picture
 
 @dataclass(frozen=True, eq=False)
 class ReliablePoints:
-    """Reliable points (`stages.framing.near_planes.reliable_points`), and who sees them.
+    """Reliable points (`stages.framing.near_planes.reliable_points`), and who sees them."""
 
-    xyz        (P, 3) training frame
-    counts     (P,) how many views see each
-    observers  (O,) these views' places in the scene, point by point
-    subject    (P,) bool, whether they lie in the scene bounds
-    """
-
-    xyz: np.ndarray
-    counts: np.ndarray
-    observers: np.ndarray
-    subject: np.ndarray
+    xyz: np.ndarray  # (P, 3) training frame
+    counts: np.ndarray  # (P,) how many views see each
+    observers: np.ndarray  # (O,) these views' places in the scene, point by point
+    subject: np.ndarray  # (P,) bool, whether they lie in the scene bounds
 
     def seen_by(self, view: int) -> np.ndarray:
         """(P,) bool: which of them the view sees."""

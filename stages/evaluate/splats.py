@@ -20,14 +20,10 @@ FIGURES = ("psnr", "ssim")
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedSplats:
-    """Gaussians to be measured.
+    """Gaussians to be measured."""
 
-    draw   what a camera sees (H, W, 3) on a colour, or on black
-    facts  that metrics.json repeats
-    """
-
-    draw: Callable[[Camera, tuple[float, float, float] | None], np.ndarray]
-    facts: dict[str, Any]
+    draw: Callable[[Camera, tuple[float, float, float] | None], np.ndarray]  # what a camera sees (H, W, 3) on a colour, or on black
+    facts: dict[str, Any]  # that metrics.json repeats
 
 
 def load_splats(outputs: SplatsOutputs, tree: NerfTree) -> EvaluatedSplats | None:

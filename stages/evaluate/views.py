@@ -20,16 +20,11 @@ MAX_PSNR = 100.0  # decibels, of equal images: JSON has no infinity
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """The image that a render is compared with.
+    """The image that a render is compared with."""
 
-    colour  (H, W, 3) float32, on the scene's background
-    mask    (H, W) bool, pixels that are compared; None: all
-    inside  (H, W) bool, pixels that the image's alpha covers; None without alpha
-    """
-
-    colour: np.ndarray
-    mask: np.ndarray | None
-    inside: np.ndarray | None
+    colour: np.ndarray  # (H, W, 3) float32, on the scene's background
+    mask: np.ndarray | None  # (H, W) bool, pixels that are compared; None: all
+    inside: np.ndarray | None  # (H, W) bool, pixels that the image's alpha covers; None without alpha
 
     @property
     def used(self) -> np.ndarray:

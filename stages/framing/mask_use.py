@@ -34,16 +34,11 @@ WRONG_CAMERAS = "; the cameras that were found from the photographs may be wrong
 
 @dataclass(frozen=True)
 class MaskUse:
-    """The meaning of a capture's masks and alpha channels, and why.
+    """The meaning of a capture's masks and alpha channels, and why."""
 
-    silhouettes  which of them are silhouettes
-    reasons      "alpha" and "masks" -> why, of those that there are
-    doubtful     names of photographs whose silhouettes do not fit to the others'
-    """
-
-    silhouettes: Silhouettes = field(default_factory=Silhouettes)
-    reasons: dict[str, str] = field(default_factory=dict)
-    doubtful: tuple[str, ...] = ()
+    silhouettes: Silhouettes = field(default_factory=Silhouettes)  # which of them are silhouettes
+    reasons: dict[str, str] = field(default_factory=dict)  # "alpha" and "masks" -> why, of those that there are
+    doubtful: tuple[str, ...] = ()  # names of photographs whose silhouettes do not fit to the others'
 
     @property
     def sentences(self) -> list[str]:

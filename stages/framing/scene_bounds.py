@@ -27,16 +27,12 @@ Ranges = Sequence[tuple[float | None, float | None]]
 
 @dataclass(frozen=True, eq=False)
 class SceneBounds:
-    """Corners of an axis-aligned box.
-
-    how  it was found, in words
-    cut  names of the photographs whose silhouettes reach out of it
-    """
+    """Corners of an axis-aligned box."""
 
     low: np.ndarray
     high: np.ndarray
-    how: str
-    cut: tuple[str, ...] = ()
+    how: str  # it was found, in words
+    cut: tuple[str, ...] = ()  # names of the photographs whose silhouettes reach out of it
 
 
 def find_scene_bounds(capture: Capture, turned: Similarity, focus: np.ndarray, converging: bool, reader: PhotoReader | None = None) -> SceneBounds:

@@ -25,26 +25,16 @@ FRONT_AZIMUTH = -90.0  # degrees, of the mean camera in captures whose frame mea
 
 @dataclass(frozen=True, eq=False)
 class TrainingFrame:
-    """The training frame of a capture.
+    """The training frame of a capture."""
 
-    world_from_capture  similarity from the capture's frame
-    bounds              (2, 3) scene bounds in the training frame, centred on the origin, largest half extent 1
-    orbit               of the cameras round the subject, training frame
-    near_far_planes     (C, 2) of each photo, along the view axis, training frame
-    space               "box", "contracted" or "ndc"
-    forward             the forward-facing scene, for ndc alone
-    silhouettes_cut     names of the photographs whose silhouettes reach out of the bounds
-    facts               how each was found, for the report
-    """
-
-    world_from_capture: Similarity
-    bounds: np.ndarray
-    orbit: Orbit
-    near_far_planes: np.ndarray
-    space: str
-    forward: ForwardFacing | None
-    silhouettes_cut: tuple[str, ...]
-    facts: dict[str, object]
+    world_from_capture: Similarity  # similarity from the capture's frame
+    bounds: np.ndarray  # (2, 3) scene bounds in the training frame, centred on the origin, largest half extent 1
+    orbit: Orbit  # of the cameras round the subject, training frame
+    near_far_planes: np.ndarray  # (C, 2) of each photo, along the view axis, training frame
+    space: str  # "box", "contracted" or "ndc"
+    forward: ForwardFacing | None  # the forward-facing scene, for ndc alone
+    silhouettes_cut: tuple[str, ...]  # names of the photographs whose silhouettes reach out of the bounds
+    facts: dict[str, object]  # how each was found, for the report
 
 
 def find_training_frame(

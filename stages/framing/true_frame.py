@@ -43,16 +43,11 @@ class KnownLength(Struct, frozen=True):
 
 
 class Ground(Struct, frozen=True):
-    """What someone set to be level.
+    """What someone set to be level."""
 
-    up      unit, in the capture's frame
-    height  of the ground along it, in the capture's unit
-    places  on it, as they were given; none where it was found
-    """
-
-    up: Vector
-    height: Number
-    places: Annotated[list[Given], Meta(max_length=3)]
+    up: Vector  # unit, in the capture's frame
+    height: Number  # of the ground along it, in the capture's unit
+    places: Annotated[list[Given], Meta(max_length=3)]  # on it, as they were given; none where it was found
 
 
 class FrameDocument(Struct, frozen=True):
@@ -66,18 +61,12 @@ class FrameDocument(Struct, frozen=True):
 
 @dataclass(frozen=True, eq=False)
 class TrueFrame:
-    """The frame that exports are in.
+    """The frame that exports are in."""
 
-    from_capture  takes the capture's frame there
-    error         of all lengths, as a share (99 %), where its unit is a metre; None: its unit is the capture's
-    lengths       that its unit was found by
-    ground        on which its z is 0, and upright; None: it is turned as the capture's
-    """
-
-    from_capture: Similarity
-    error: float | None
-    lengths: tuple[KnownLength, ...]
-    ground: Ground | None = None
+    from_capture: Similarity  # takes the capture's frame there
+    error: float | None  # of all lengths, as a share (99 %), where its unit is a metre; None: its unit is the capture's
+    lengths: tuple[KnownLength, ...]  # that its unit was found by
+    ground: Ground | None = None  # on which its z is 0, and upright; None: it is turned as the capture's
 
     @property
     def up(self) -> np.ndarray | None:

@@ -18,36 +18,25 @@ Lens = Literal["zoomed", "cropped"]
 
 @dataclass(frozen=True)
 class Photo:
-    """One image of the source and the camera that took it.
+    """One image of the source and the camera that took it."""
 
-    camera      in the capture's frame, for the image after EXIF rotation, at the source's full size; its name is the image's
-                path relative to the source folder
-    image       the file itself, without links
-    mask        the file of its mask, without links, or None
-    mask_ignore "black" if zero pixels of the mask are left out, "white" if the non-zero ones are
-    split       "train", "val" or "test" where the source states it, else None
-    near, far   along the view axis in the capture's units where the source states it, else None
-    """
-
+    # in the capture's frame, for the image after EXIF rotation, at the source's full size; its name is the image's path relative to the source folder
     camera: Camera
-    image: Path
-    mask: Path | None = None
-    mask_ignore: str = "black"
-    split: str | None = None
+    image: Path  # the file itself, without links
+    mask: Path | None = None  # the file of its mask, without links, or None
+    mask_ignore: str = "black"  # "black" if zero pixels of the mask are left out, "white" if the non-zero ones are
+    split: str | None = None  # "train", "val" or "test" where the source states it, else None
+    # near, far: along the view axis in the capture's units where the source states it, else None
     near: float | None = None
     far: float | None = None
 
 
 @dataclass(frozen=True)
 class Silhouettes:
-    """Which of the two are silhouettes: pixels they leave out are background. Else those pixels are ignored.
+    """Which of the two are silhouettes: pixels they leave out are background. Else those pixels are ignored."""
 
-    alpha  alpha channels of the photographs
-    masks  mask files
-    """
-
-    alpha: bool = False
-    masks: bool = False
+    alpha: bool = False  # alpha channels of the photographs
+    masks: bool = False  # mask files
 
     def __bool__(self) -> bool:
         return self.alpha or self.masks
@@ -55,18 +44,12 @@ class Silhouettes:
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """Sparse points of structure from motion or a depth sensor.
+    """Sparse points of structure from motion or a depth sensor."""
 
-    xyz        (N, 3) float64, the capture's frame
-    rgb        (N, 3) uint8, sRGB
-    error      (N,)   float64 mean reprojection error, pixels (nan where unknown)
-    tracks     of each point the indices of the photos that observe it (empty where unknown)
-    """
-
-    xyz: np.ndarray
-    rgb: np.ndarray
-    error: np.ndarray
-    tracks: tuple[tuple[int, ...], ...]
+    xyz: np.ndarray  # (N, 3) float64, the capture's frame
+    rgb: np.ndarray  # (N, 3) uint8, sRGB
+    error: np.ndarray  # (N,) float64 mean reprojection error, pixels (nan where unknown)
+    tracks: tuple[tuple[int, ...], ...]  # of each point the indices of the photos that observe it (empty where unknown)
 
     def only(self, kept: np.ndarray) -> SparsePoints:
         """The points of these indices."""
@@ -109,44 +92,26 @@ Markers = dict[str, dict[int, np.ndarray]]  # name of a photograph -> number of 
 
 @dataclass(frozen=True)
 class Capture:
-    """A source, read.
+    """A source, read."""
 
-    kind        "photographs", "blender", "nerfstudio", "instant-ngp", "llff" or "colmap"
-    photos      in sorted order of name within each split; all registered
-    background  the constant sRGB colour (0-1) that transparent pixels are composited on, of bounded scenes; None: unbounded
-    silhouettes whether alpha channels and masks are silhouettes
-    up          unit up vector in the capture's frame where the format defines one (Blender: +z), else None
-    points      or None
-    bounds      (2, 3) box in the capture's frame where the source states one (instant-ngp's aabb), else None
-    rejected    (name, reason) of each image that could not be used
-    rejected_files  name -> file, without links, of those of the rejected that are there
-    warnings    sentences for the user
-    reprojection_error  mean, pixels, where known
-    metric      whether a unit of the capture's frame is known to be a metre
-    facts       what the format states besides; the report repeats it, nothing follows from it
-    provenance  how the cameras were found, of photographs that state none
-    overlaps    (name, name, verified matches) of pairs of photographs, registered or not, where they were compared
-    markers     those in the photographs, where they were looked for
-    markers_up  (3,) unit, in the capture's frame: up by the markers that lie on the ground, if any do
-    """
-
-    kind: str
-    photos: tuple[Photo, ...]
+    kind: str  # "photographs", "blender", "nerfstudio", "instant-ngp", "llff" or "colmap"
+    photos: tuple[Photo, ...]  # in sorted order of name within each split; all registered
+    # the constant sRGB colour (0-1) that transparent pixels are composited on, of bounded scenes; None: unbounded
     background: tuple[float, float, float] | None
-    silhouettes: Silhouettes = Silhouettes()
-    up: np.ndarray | None = None
+    silhouettes: Silhouettes = Silhouettes()  # whether alpha channels and masks are silhouettes
+    up: np.ndarray | None = None  # unit up vector in the capture's frame where the format defines one (Blender: +z), else None
     points: SparsePoints | None = None
-    bounds: np.ndarray | None = None
-    rejected: tuple[tuple[str, str], ...] = ()
-    warnings: tuple[str, ...] = ()
-    reprojection_error: float | None = None
-    metric: bool = False
-    facts: dict[str, object] = field(default_factory=dict)
-    provenance: Provenance = field(default_factory=Provenance)
-    rejected_files: dict[str, Path] = field(default_factory=dict)
-    overlaps: tuple[tuple[str, str, int], ...] = ()
-    markers: Markers | None = None
-    markers_up: np.ndarray | None = None
+    bounds: np.ndarray | None = None  # (2, 3) box in the capture's frame where the source states one (instant-ngp's aabb), else None
+    rejected: tuple[tuple[str, str], ...] = ()  # (name, reason) of each image that could not be used
+    warnings: tuple[str, ...] = ()  # sentences for the user
+    reprojection_error: float | None = None  # mean, pixels, where known
+    metric: bool = False  # whether a unit of the capture's frame is known to be a metre
+    facts: dict[str, object] = field(default_factory=dict)  # what the format states besides; the report repeats it, nothing follows from it
+    provenance: Provenance = field(default_factory=Provenance)  # how the cameras were found, of photographs that state none
+    rejected_files: dict[str, Path] = field(default_factory=dict)  # name -> file, without links, of those of the rejected that are there
+    overlaps: tuple[tuple[str, str, int], ...] = ()  # (name, name, verified matches) of pairs of photographs, registered or not, where they were compared
+    markers: Markers | None = None  # those in the photographs, where they were looked for
+    markers_up: np.ndarray | None = None  # (3,) unit, in the capture's frame: up by the markers that lie on the ground, if any do
 
 
 def without(capture: Capture, kept: Sequence[int], failed: Sequence[tuple[str, str]]) -> Capture:

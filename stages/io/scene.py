@@ -42,19 +42,15 @@ WORKING_FORMATS = ("PNG", "JPEG")  # of images/; masks/ hold PNG
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One image of the scene.
+    """One image of the scene."""
 
-    image, mask    paths relative to the folder of the scene; mask: 0/255 PNG of the image's size, 255 = use, or None
-    camera         in the training frame, at the size of `image`
-    source_camera  in the capture's frame, at the size of the source image after EXIF rotation
-    near, far      world units, along the view axis
-    """
-
+    # image, mask: paths relative to the folder of the scene; mask: 0/255 PNG of the image's size, 255 = use, or None
     image: str
     mask: str | None
     split: str
-    camera: Camera
-    source_camera: Camera
+    camera: Camera  # in the training frame, at the size of `image`
+    source_camera: Camera  # in the capture's frame, at the size of the source image after EXIF rotation
+    # near, far: world units, along the view axis
     near: float
     far: float
 

@@ -40,32 +40,25 @@ Models = list[Any]  # sub-models, largest first
 class Search:
     """The best result so far, and what the attempts share.
 
-    base, images, seed  the scratch folder, its photographs, whose features are detected
-    features  of a photograph, at most
-    threads   on which features are detected, and processes in which pairs are matched
-    networks  files of a detector and a matcher, for photographs that are left without a camera
-    place     the scratch folder whose matches are used: `base`, or one in it
-    models, best, work  of the best attempt: its sub-models, its name, and the scratch folder whose database they are of
-    agreement share of the matches that agrees with it
-    tried     all attempts: the name, the number of photographs that had a camera then, and the share of matches that agreed
-    others    sub-models of the mapper's first run that are not merged
-    own       sub-models with a camera for each photograph, once they were looked for
+    place  the scratch folder whose matches are used: `base`, or one in it
+    work   the scratch folder whose database the models are of
     """
 
-    base: Path
-    images: Sequence[WorkImage]
+    base: Path  # the scratch folder
+    images: Sequence[WorkImage]  # its photographs, whose features are detected
     seed: int
-    features: int
-    threads: int
+    features: int  # of a photograph, at most
+    threads: int  # on which features are detected, and processes in which pairs are matched
     progress: Progress
     safe_point: SafePoint
-    networks: tuple[Path, Path] | None = None
-    models: Models = field(default_factory=list)
-    best: str = ""
-    agreement: float = 0.0
+    networks: tuple[Path, Path] | None = None  # files of a detector and a matcher, for photographs that are left without a camera
+    models: Models = field(default_factory=list)  # sub-models of the best attempt
+    best: str = ""  # its name
+    agreement: float = 0.0  # share of the matches that agrees with it
+    # all attempts: the name, the number of photographs that had a camera then, and the share of matches that agreed
     tried: list[dict[str, object]] = field(default_factory=list)
-    others: Models = field(default_factory=list)
-    own: Models | None = None
+    others: Models = field(default_factory=list)  # sub-models of the mapper's first run that are not merged
+    own: Models | None = None  # sub-models with a camera for each photograph, once they were looked for
     _score: float = 0.0
 
     def __post_init__(self) -> None:

@@ -56,34 +56,22 @@ ATTEMPTS = (
 
 @dataclass(frozen=True)
 class Request:
-    """
-    folder    of the photographs, for errors
-    paths     the file of each photograph, by name
-    work      scratch folder; what a killed call left in it is used again, and the result has the same bits
-    max_side  longest side of the photographs in which features are detected, pixels
-    features  most features of a photograph; None: as `pairs.features_for` has it
-    matching  "exhaustive", "retrieval", "sequential" (the sorted names follow a path; `stages.sfm.pairs`), or "auto": exhaustive up to 60 photographs
-    threads   on which features are detected, and processes in which pairs are matched; None: as many as the process may use. Changes no bit
-    masks     of some or all names: no features where the mask is black, nor where a photograph is transparent; None: features everywhere
-    lens      "fisheye", "perspective", or "auto": fisheye where EXIF data say so
-    networks  files of a detector and a matcher (`stages.sfm.added.networks`), for photographs that SIFT leaves without a camera
-    copies    folder in which the stage keeps photographs that were decoded; None: one in the scratch folder
-    markers   those in the photographs, whose corners tie them
-    """
-
-    folder: Path
-    paths: dict[str, Path]
-    work: Path
-    max_side: int = 1600
-    features: int | None = None
+    folder: Path  # of the photographs, for errors
+    paths: dict[str, Path]  # the file of each photograph, by name
+    work: Path  # scratch folder; what a killed call left in it is used again, and the result has the same bits
+    max_side: int = 1600  # longest side of the photographs in which features are detected, pixels
+    features: int | None = None  # most features of a photograph; None: as `pairs.features_for` has it
+    # "exhaustive", "retrieval", "sequential" (the sorted names follow a path; `stages.sfm.pairs`), or "auto": exhaustive up to 60 photographs
     matching: str = "auto"
     seed: int = 0
-    threads: int | None = None
+    threads: int | None = None  # on which features are detected, and processes in which pairs are matched; None: as many as the process may use. Changes no bit
+    # of some or all names: no features where the mask is black, nor where a photograph is transparent; None: features everywhere
     masks: dict[str, Path | None] = field(default_factory=dict)
-    lens: str = "auto"
+    lens: str = "auto"  # "fisheye", "perspective", or "auto": fisheye where EXIF data say so
+    # files of a detector and a matcher (`stages.sfm.added.networks`), for photographs that SIFT leaves without a camera
     networks: tuple[Path, Path] | None = None
-    copies: Path | None = None
-    markers: Markers = field(default_factory=dict)
+    copies: Path | None = None  # folder in which the stage keeps photographs that were decoded; None: one in the scratch folder
+    markers: Markers = field(default_factory=dict)  # those in the photographs, whose corners tie them
 
 
 def reconstruct(r: Request, **callables: Unpack[Callables]) -> Capture:

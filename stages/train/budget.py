@@ -54,22 +54,14 @@ def schedule_state(found: object, hold: int) -> dict[str, Any]:
 
 @dataclass
 class Budget:
-    """The schedule of steps that are to take so many seconds.
+    """The schedule of steps that are to take so many seconds."""
 
-    budget    seconds
-    schedule  to begin with, of UNKNOWN iterations and with a hold after which their number is set, or one that was written down
-    warmup    steps that are not timed
-    spent     seconds of it that earlier attempts took
-    clock     seconds, monotonic
-    written   is given each schedule that is set
-    """
-
-    budget: float
-    schedule: Schedule
-    warmup: int
-    spent: float = 0.0
-    clock: Callable[[], float] = time.monotonic
-    written: Callable[[Schedule], object] = lambda schedule: None
+    budget: float  # seconds
+    schedule: Schedule  # to begin with, of UNKNOWN iterations and with a hold after which their number is set, or one that was written down
+    warmup: int  # steps that are not timed
+    spent: float = 0.0  # seconds of it that earlier attempts took
+    clock: Callable[[], float] = time.monotonic  # seconds
+    written: Callable[[Schedule], object] = lambda schedule: None  # is given each schedule that is set
     started: float = field(init=False)
     timed: tuple[int, float] | None = field(init=False, default=None)  # step and seconds from which on steps are timed
     marks: list[float] = field(init=False)  # seconds at which the number is set again, those to come

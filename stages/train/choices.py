@@ -23,17 +23,11 @@ NEAR_SHARE = 0.1  # of the cameras' distance from the subject: a near plane that
 
 @dataclass(frozen=True)
 class TrainingChoices:
-    """
-    near               near planes as the scene states them; none farther than their median; or none farther than NEAR_SHARE of the way to the subject
-    masks              whether the views' masks are used
-    min_views          whether `train.min_views` is
-    exposure           whether exposure of the photographs is learned although the settings do not say so
-    """
-
+    # near planes as the scene states them; none farther than their median; or none farther than NEAR_SHARE of the way to the subject
     near: Literal["stated", "median", "off"] = "stated"
-    masks: bool = True
-    min_views: bool = True
-    exposure: bool = False
+    masks: bool = True  # whether the views' masks are used
+    min_views: bool = True  # whether `train.min_views` is
+    exposure: bool = False  # whether exposure of the photographs is learned although the settings do not say so
 
     def settings(self, given: TrainSettings) -> TrainSettings:
         """The settings with these choices."""

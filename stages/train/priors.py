@@ -29,17 +29,12 @@ from stages.io.scene import View
 
 @dataclass(frozen=True)
 class Prior:
-    """The effect of a prior.
-
-    masked        share of the density voxels
-    contradicted  share of the reliable sparse points that lie in them
-    applied       whether it was
-    """
+    """The effect of a prior."""
 
     name: str
-    masked: float
-    contradicted: float
-    applied: bool
+    masked: float  # share of the density voxels
+    contradicted: float  # share of the reliable sparse points that lie in them
+    applied: bool  # whether it was
 
 
 def mask_uncovered_cells(m: Model, views: tuple[View, ...], job: Job) -> tuple[Prior, ...]:

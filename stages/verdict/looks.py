@@ -32,26 +32,16 @@ FLAT = 4.0  # of 255, standard deviation of a small picture that all others of i
 
 @dataclass(frozen=True)
 class Look:
-    """Of one photograph.
+    """Of one photograph."""
 
-    sharpness   root of the mean square of differences between neighbouring pixels, over that of pixels COARSE apart; 0 of no texture
-    brightness  stops: log2 of the mean of linear light, 0 is white
-    clipped     share of pixels that are black or white
-    noise       levels, standard deviation: of a quarter of the blocks there is less
-    longest     px of the longest side, as far as it was looked at
-    small       (16, 24) float32 levels
-    compressed  whether it was compressed so strongly that its blocks show
-    over_points  `over_points`; None where that is not known
-    """
-
-    sharpness: float
-    brightness: float
-    clipped: float
-    noise: float
-    longest: int
-    small: np.ndarray
-    compressed: bool = False
-    over_points: float | None = None
+    sharpness: float  # root of the mean square of differences between neighbouring pixels, over that of pixels COARSE apart; 0 of no texture
+    brightness: float  # stops: log2 of the mean of linear light, 0 is white
+    clipped: float  # share of pixels that are black or white
+    noise: float  # levels, standard deviation: of a quarter of the blocks there is less
+    longest: int  # px of the longest side, as far as it was looked at
+    small: np.ndarray  # (16, 24) float32 levels
+    compressed: bool = False  # whether it was compressed so strongly that its blocks show
+    over_points: float | None = None  # `over_points`; None where that is not known
 
     def figures(self) -> dict[str, float | bool]:
         """As JSON has them."""

@@ -20,13 +20,8 @@ MAX_POINTS = 2000  # points that are looked at
 
 @dataclass(frozen=True)
 class Parallax:
-    """
-    angle    degrees: the median over the points of the subject, else over all, of the largest angle between two rays of a track
-    subject  whether the cameras look from different sides at a subject that is there
-    """
-
-    angle: float
-    subject: bool
+    angle: float  # degrees: the median over the points of the subject, else over all, of the largest angle between two rays of a track
+    subject: bool  # whether the cameras look from different sides at a subject that is there
 
     @property
     def small(self) -> bool:

@@ -60,20 +60,13 @@ PAIRS_AN_IMAGE = 20  # of retrieval
 
 @dataclass(frozen=True)
 class Small:
-    """A small picture.
+    """A small picture."""
 
-    keypoints    (N, 2) px
-    descriptors  (N, 128) uint8
-    size         of the photograph, as stored, pixels
-    focal        pixels of the photograph by its EXIF data, or None
-    seconds      of the processor, that its features took
-    """
-
-    keypoints: np.ndarray
-    descriptors: np.ndarray
-    size: tuple[int, int]
-    focal: float | None
-    seconds: float
+    keypoints: np.ndarray  # (N, 2) px
+    descriptors: np.ndarray  # (N, 128) uint8
+    size: tuple[int, int]  # of the photograph, as stored, pixels
+    focal: float | None  # pixels of the photograph by its EXIF data, or None
+    seconds: float  # of the processor, that its features took
 
 
 def check(folder: Path, settings: Any, threads: int, later: Mapping[str, Any] | None = None) -> Verdict:
@@ -144,16 +137,11 @@ def _small(path: Path, grey: np.ndarray) -> Small:
 
 @dataclass(frozen=True)
 class Overlap:
-    """Of two pictures.
+    """Of two pictures."""
 
-    matches  that fit one epipolar geometry
-    still    share of them that do not move
-    plane    share of them that fit one homography, as of a camera that turns on its spot
-    """
-
-    matches: int
-    still: float
-    plane: float
+    matches: int  # that fit one epipolar geometry
+    still: float  # share of them that do not move
+    plane: float  # share of them that fit one homography, as of a camera that turns on its spot
 
 
 def _overlaps(small: Sequence[Small], seed: int) -> dict[pairs.Pair, Overlap]:

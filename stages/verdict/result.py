@@ -42,23 +42,13 @@ DEPTH = f"{RUN}/{EvaluateOutputs.sparse_points}"
 
 @dataclass(frozen=True)
 class ResultProblem:
-    """
-    what      a word for it
-    grade     the best that a result with it can have
-    sentence  it, in words
-    cause     what it is likely to come from
-    remedy    what to do
-    picture   that shows it: its path in the run
-    images    names of the views that show it
-    """
-
-    what: str
-    grade: str
-    sentence: str
-    cause: str
-    remedy: str
-    picture: str
-    images: tuple[str, ...] = ()
+    what: str  # a word for it
+    grade: str  # the best that a result with it can have
+    sentence: str  # it, in words
+    cause: str  # what it is likely to come from
+    remedy: str  # what to do
+    picture: str  # that shows it: its path in the run
+    images: tuple[str, ...] = ()  # names of the views that show it
 
     def text(self) -> str:
         """All of it in a line."""
@@ -67,15 +57,9 @@ class ResultProblem:
 
 @dataclass(frozen=True)
 class ResultVerdict:
-    """
-    grade     one of GRADES
-    problems  worst first
-    figures   that it was made from
-    """
-
-    grade: str
-    problems: tuple[ResultProblem, ...]
-    figures: Mapping[str, Any] = field(default_factory=dict)
+    grade: str  # one of GRADES
+    problems: tuple[ResultProblem, ...]  # worst first
+    figures: Mapping[str, Any] = field(default_factory=dict)  # that it was made from
 
     def document(self) -> dict[str, Any]:
         """As JSON has it."""

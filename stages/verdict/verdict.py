@@ -44,34 +44,19 @@ MORE_PHOTOGRAPHS = "Take more photographs between those that do not fit together
 
 @dataclass(frozen=True)
 class Problem:
-    """
-    what      a word for it
-    grade     the best that a capture with this problem can have
-    sentence  it, in words
-    remedy    what to do
-    images    names of the photographs that show it
-    """
-
-    what: str
-    grade: str
-    sentence: str
-    remedy: str
-    images: tuple[str, ...] = ()
+    what: str  # a word for it
+    grade: str  # the best that a capture with this problem can have
+    sentence: str  # it, in words
+    remedy: str  # what to do
+    images: tuple[str, ...] = ()  # names of the photographs that show it
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """
-    grade     one of GRADES
-    problems  worst first
-    figures   of the capture
-    images    of each photograph
-    """
-
-    grade: str
-    problems: tuple[Problem, ...]
-    figures: Mapping[str, Any] = field(default_factory=dict)
-    images: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    grade: str  # one of GRADES
+    problems: tuple[Problem, ...]  # worst first
+    figures: Mapping[str, Any] = field(default_factory=dict)  # of the capture
+    images: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # of each photograph
 
     def document(self) -> dict[str, Any]:
         """As JSON has it."""

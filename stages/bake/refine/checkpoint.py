@@ -44,25 +44,16 @@ class _About(msgspec.Struct, forbid_unknown_fields=True):
 
 @dataclass
 class Point:
-    """How far a refinement is.
-
-    schedule  of the steps
-    phase     number of the one whose steps are taken
-    pruned    what was dropped after the first; None in it
-    kept      (N,) bool, the voxels that were not dropped; None: all
-    seconds   of the stage up to here
-    began     seconds at which the phase began
-    allotted  seconds that it may take, where there is a budget
-    """
+    """How far a refinement is."""
 
     state: RefinementState
-    schedule: RefinementSchedule
-    phase: int = 0
-    pruned: Pruned | None = None
-    kept: np.ndarray | None = None
-    seconds: float = 0.0
-    began: float = 0.0
-    allotted: float = 0.0
+    schedule: RefinementSchedule  # of the steps
+    phase: int = 0  # number of the one whose steps are taken
+    pruned: Pruned | None = None  # what was dropped after the first; None in it
+    kept: np.ndarray | None = None  # (N,) bool, the voxels that were not dropped; None: all
+    seconds: float = 0.0  # of the stage up to here
+    began: float = 0.0  # seconds at which the phase began
+    allotted: float = 0.0  # seconds that it may take, where there is a budget
 
 
 def save(job: Job, point: Point) -> None:

@@ -53,27 +53,20 @@ UNREFINED = 0.1  # of the steps that are usual: with fewer the asset is hardly r
 
 @dataclass(eq=False)
 class Refinement:
-    """A refinement that is going on.
-
-    most      voxels that the asset holds
-    budget    seconds of the stage up to the end of the last step, or None
-    per_ray   seconds that measuring the error of a ray took
-    samples   of the field, for unbounded scenes: they restore what was dropped wrongly
-    baked     (N,) of unbounded scenes the densities before the first step
-    """
+    """A refinement that is going on."""
 
     job: Job
     scene: Scene
     plan: Bake
     targets: Targets
-    most: int
+    most: int  # voxels that the asset holds
     stopwatch: Stopwatch
     point: Point
     log: RefinementLog
-    budget: float | None
-    per_ray: float = 0.0
-    samples: FieldSamples | None = None
-    baked: np.ndarray | None = None
+    budget: float | None  # seconds of the stage up to the end of the last step, or None
+    per_ray: float = 0.0  # seconds that measuring the error of a ray took
+    samples: FieldSamples | None = None  # of the field, for unbounded scenes: they restore what was dropped wrongly
+    baked: np.ndarray | None = None  # (N,) of unbounded scenes the densities before the first step
     written: float = field(default_factory=clock)
 
     def run(self) -> NerfTree:

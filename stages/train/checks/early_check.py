@@ -38,32 +38,24 @@ PLAIN_PSNR = 30.0  # dB: from here on nothing is
 
 @dataclass(frozen=True, eq=False)
 class HeldOutView:
-    """A small view to compare with.
-
-    colour   (H, W, 3) float32 of the photograph
-    counted  (H, W) bool, the pixels that are compared
-    """
+    """A small view to compare with."""
 
     camera: Camera
-    colour: np.ndarray
-    counted: np.ndarray
+    colour: np.ndarray  # (H, W, 3) float32 of the photograph
+    counted: np.ndarray  # (H, W) bool, the pixels that are compared
 
 
 @dataclass(frozen=True)
 class EarlyResult:
-    """Medians over the views that were compared.
+    """Medians over the views that were compared."""
 
-    step                                  after which
-    psnr, mean_colour_psnr, blurred_psnr  dB of the renders, and of the two pictures that know nothing
-    progress                              see the module
-    """
-
-    step: int
+    step: int  # after which
     views: int
+    # psnr, mean_colour_psnr, blurred_psnr: dB of the renders, and of the two pictures that know nothing
     psnr: float
     mean_colour_psnr: float
     blurred_psnr: float
-    progress: float
+    progress: float  # see the module
 
     @property
     def learning(self) -> bool:

@@ -29,17 +29,10 @@ REMEDY = "Check the cameras and photographs in the report. If there are masks, t
 
 @dataclass(frozen=True)
 class _Decision:
-    """
-    chosen   name of the trial whose choices training begins again with; None: it goes on as it is
-    choices  of that trial
-    seconds  that were trained in vain
-    trials   all that were made, in their order
-    """
-
-    chosen: str | None
-    choices: TrainingChoices
-    seconds: float
-    trials: list[Trial]
+    chosen: str | None  # name of the trial whose choices training begins again with; None: it goes on as it is
+    choices: TrainingChoices  # of that trial
+    seconds: float  # that were trained in vain
+    trials: list[Trial]  # all that were made, in their order
 
 
 class Watch:
