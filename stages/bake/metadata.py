@@ -5,7 +5,6 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from efficientnerf.asset.captured import captured_metadata
-from efficientnerf.capture.forward_facing import ForwardFacing
 from efficientnerf.model import Model
 from pipeline.hashes import sha256_of
 from pipeline.stage import Job
@@ -26,12 +25,16 @@ def metadata_of(s: Scene, settings: BakeSettings, m: Model) -> dict[str, Any]:
         tool = version("efficientnerf")
     except PackageNotFoundError:
         tool = "unknown"
+    spiral: dict[str, Any] = {}
+    if (forward := s.forward) is not None:
+        radii, tangents = ([float(x) for x in values] for values in (forward.radii, forward.tangents))
+        spiral = {"radii": radii, "focus": float(forward.focus), "tangents": tangents, "far": float(forward.far)}
     return {
         "world_from_capture": similarity_to_json(s.world_from_capture),
         "orbit": asdict(s.orbit),
         "captured_path": captured_metadata([view.camera for view in s.views]),
         "metric": bool(s.metric),
-        **({} if s.forward is None else {"spiral": _spiral_of(s.forward)}),
+        **({"spiral": spiral} if spiral else {}),
         "licence": settings.licence,
         "provenance": {
             "tool": f"efficientnerf {tool}",
@@ -39,14 +42,4 @@ def metadata_of(s: Scene, settings: BakeSettings, m: Model) -> dict[str, Any]:
             "training_views": sum(v.split == "train" for v in s.views),
             "iterations": m.settings.iterations,
         },
-    }
-
-
-def _spiral_of(forward: ForwardFacing) -> dict[str, Any]:
-    """The parameters of a camera path for a forward-facing scene."""
-    return {
-        "radii": [float(x) for x in forward.radii],
-        "focus": float(forward.focus),
-        "tangents": [float(x) for x in forward.tangents],
-        "far": float(forward.far),
     }

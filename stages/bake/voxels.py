@@ -103,7 +103,16 @@ class OneGrid:
     def __init__(self, job: Job, plan: Bake, m: Model, s: Scene, pixels: Pixels) -> None:
         self.job, self.plan, self.s, self.finest = job, plan, s, plan.resolution
         self.top = grid_over(plan.space, self.finest.resolution, plan.brick_size)
-        self.measured = _visibility(job, m, pixels, self.top, plan.space)
+        settings: BakeSettings = job.settings
+
+        def fits(found: Visibility) -> bool:
+            ascending = not len(found.cells) or (found.cells[0] >= 0 and found.cells[-1] < coarse_cells([self.top]) and (np.diff(found.cells) > 0).all())
+            return bool(ascending and found.greatest.shape == (len(found.cells), settings.brick_size**3))
+
+        def measured(progress: Callable[[int, int], None]) -> Visibility:
+            return bake.visible_voxels(m, pixels, *self.top, settings.brick_size, settings.visibility_rays, progress, plan.space)
+
+        self.measured = rendered_once(job, "visibility", Visibility, {"cells": ("int64", 1), "greatest": ("float32", 2)}, fits, measured)
 
     def grids(self, resolution: int) -> list[Grid]:
         return [grid_over(self.plan.space, resolution, self.plan.brick_size)]
@@ -144,25 +153,6 @@ def seen_by_few(job: Job, s: Scene, ndc: Ndc, points: np.ndarray) -> np.ndarray:
     views = scene.views_of(s, "train")
     well = min(WELL_SEEN_VIEWS, -(-len(views) // 2))
     return count_views(ndc.world(points), [view.camera for view in views], kept_pixels(job.inputs["poses"], views)) < well
-
-
-def _visibility(job: Job, m: Model, pixels: Pixels, grid: Grid, space: Space) -> Visibility:
-    """The visibility of voxels, computed or from an earlier attempt."""
-    settings: BakeSettings = job.settings
-
-    def fits(found: Visibility) -> bool:
-        return _fits(found, coarse_cells([grid]), settings.brick_size**3)
-
-    def measured(progress: Callable[[int, int], None]) -> Visibility:
-        return bake.visible_voxels(m, pixels, *grid, settings.brick_size, settings.visibility_rays, progress, space)
-
-    return rendered_once(job, "visibility", Visibility, {"cells": ("int64", 1), "greatest": ("float32", 2)}, fits, measured)
-
-
-def _fits(found: Visibility, cells: int, per_cell: int) -> bool:
-    """Whether a visibility is of so many coarse cells with so many voxels each."""
-    ascending = not len(found.cells) or (found.cells[0] >= 0 and found.cells[-1] < cells and (np.diff(found.cells) > 0).all())
-    return bool(ascending and found.greatest.shape == (len(found.cells), per_cell))
 
 
 def chosen_of(seen: Sequence[Visibility], grids: Sequence[Grid], settings: BakeSettings, threshold: float) -> list[np.ndarray]:

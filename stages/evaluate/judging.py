@@ -12,7 +12,6 @@ from stages.bake.refine.refinement import usual_steps
 from stages.bake.settings import BakeSettings
 from stages.evaluate import sparse_points
 from stages.evaluate.comparison import Evaluation, compare, counting, trivial
-from stages.evaluate.sparse_points import ReliablePoints
 from stages.evaluate.summary import means
 from stages.evaluate.trivial import equivalent_blur
 from stages.evaluate.views import evenly_spaced
@@ -44,24 +43,20 @@ def judge(e: Evaluation, views: Sequence[View], metrics: Mapping[str, Any]) -> N
     """Write the verdict on a result and the picture of its sparse points; report it, with a warning for each problem."""
     cameras = PosesOutputs(e.job.inputs["poses"]).verdict
     if e.points is not None:
-        _draw(e, e.points, views, metrics)
+        # the view whose points agree least with the asset's depth
+        counts = [found["sparse_points"] for found in metrics["views"]]
+        shares = [1.0 if not found["points"] else 1 - (found["nearer"] + found["farther"]) / found["points"] for found in counts]
+        view = views[shares.index(min(shares))]
+        e.job.safe_point()
+        truth, depth = e.truth(view), e.asset.render(view.camera, normals=False).depth
+        pixels, kinds, _ = sparse_points.judged(e.points, e.scene.views.index(view), view.camera, depth, counting(truth))
+        write_png(sparse_points.picture(truth.colour, depth, pixels, kinds), EvaluateOutputs(e.job.out).sparse_points)
     found = verdict_on_result(metrics, read_report(cameras, CameraVerdict) if cameras.is_file() else None)
     write_json(EvaluateOutputs(e.job.out).verdict, found.document())
     e.job.say(found.summary(), grade=found.grade)
     for problem in found.problems:
         if problem.grade != "good":
             e.job.warn(problem.text())
-
-
-def _draw(e: Evaluation, points: ReliablePoints, views: Sequence[View], metrics: Mapping[str, Any]) -> None:
-    """Of the view whose points agree least with the asset's depth."""
-    counts = [found["sparse_points"] for found in metrics["views"]]
-    shares = [1.0 if not found["points"] else 1 - (found["nearer"] + found["farther"]) / found["points"] for found in counts]
-    view = views[shares.index(min(shares))]
-    e.job.safe_point()
-    truth, depth = e.truth(view), e.asset.render(view.camera, normals=False).depth
-    pixels, kinds, _ = sparse_points.judged(points, e.scene.views.index(view), view.camera, depth, counting(truth))
-    write_png(sparse_points.picture(truth.colour, depth, pixels, kinds), EvaluateOutputs(e.job.out).sparse_points)
 
 
 def refinement_of(bake: BakeOutputs) -> dict[str, int]:

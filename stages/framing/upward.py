@@ -23,7 +23,15 @@ def with_up(capture: Capture, choice: str, say: Callable[[str], None], warn: Cal
 
     choice  `poses.up`, which is taken whatever they say
     """
-    found = _said(capture)
+    # The upward axes that are known, by what says them, the most trusted first.
+    found: dict[str, np.ndarray] = {}
+    gps, gravity = capture.provenance.gps, up_by_gravity(capture)
+    if capture.up is not None:
+        found["GPS" if gps is not None and "up" in gps.used else "the source"] = np.asarray(capture.up, np.float64) / np.linalg.norm(capture.up)
+    if capture.markers_up is not None:
+        found["markers"] = capture.markers_up
+    if gravity is not None:
+        found["gravity"] = gravity
     by = next(iter(found), THE_CAMERAS)
     cameras = estimated_up([photo.camera for photo in capture.photos])
     up = found.get(by, cameras)
@@ -39,17 +47,6 @@ def with_up(capture: Capture, choice: str, say: Callable[[str], None], warn: Cal
         say(f"{PLANE} is {degrees[PLANE]:.0f} degrees off level by {by}. If it is level: enerf orient RUN --plane, afterwards.")
     facts = capture.facts | {"up": {"by": by, "degrees": degrees}}
     return replace(capture, facts=facts, up=capture.up if by in (THE_CAMERAS, "poses.up") else up)
-
-
-def _said(capture: Capture) -> dict[str, np.ndarray]:
-    """The upward axes that are known, by what says them, the most trusted first."""
-    found, gps = {}, capture.provenance.gps
-    if capture.up is not None:
-        found["GPS" if gps is not None and "up" in gps.used else "the source"] = np.asarray(capture.up, np.float64) / np.linalg.norm(capture.up)
-    if capture.markers_up is not None:
-        found["markers"] = capture.markers_up
-    gravity = up_by_gravity(capture)
-    return found if gravity is None else found | {"gravity": gravity}
 
 
 def up_by_gravity(capture: Capture) -> np.ndarray | None:

@@ -66,7 +66,13 @@ def read_photo(path: Path, max_side: int) -> DecodedPhoto:
         full = image.size
         # As the sensor has it, which the numbers of EXIF refer to: libheif has turned the pixels already.
         taken = full[::-1] if image.info.get("original_orientation") in range(5, 9) else full
-        _draft(image, max_side)
+        # Let the JPEG decoder downscale by a power of two where that is exact and still above the working size.
+        if image.format == "JPEG" and image.mode in ("RGB", "L"):
+            scale = 1
+            while scale < 8 and max(image.size) >= 2 * scale * max_side and all(side % (2 * scale) == 0 for side in image.size):
+                scale *= 2
+            if scale > 1:
+                image.draft(image.mode, (image.size[0] // scale, image.size[1] // scale))
         rgb, alpha = rgb_and_alpha(image)
     width, height = full if orientation < 5 else full[::-1]
     rgb = resized(apply_exif_orientation(rgb, orientation), working_size(width, height, max_side))
@@ -98,13 +104,8 @@ def read_levels(path: Path, orientation: int, width: int, height: int) -> tuple[
 
 def marked_at(levels: np.ndarray, lossy: bool, size: tuple[int, int]) -> np.ndarray:
     """Where a mask is not black, (h, w) bool at a working size (width, height); what a lossy format makes of black is up to 127."""
-    return mask_at(levels, size) > (127 if lossy else 0)
-
-
-def mask_at(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """The mask (H, W) at a working size (width, height): the pixel at the middle of each."""
-    rows, columns = (((np.arange(side) + 0.5) * own / side).astype(int) for side, own in zip(size[::-1], mask.shape, strict=True))
-    return np.asarray(mask[rows][:, columns])
+    rows, columns = (((np.arange(side) + 0.5) * own / side).astype(int) for side, own in zip(size[::-1], levels.shape, strict=True))
+    return np.asarray(levels[rows][:, columns]) > (127 if lossy else 0)
 
 
 def upright_mask(mask: np.ndarray, orientation: int, width: int, height: int) -> np.ndarray:
@@ -198,16 +199,6 @@ def _number(value: Any) -> float | None:
     except (TypeError, ValueError, ZeroDivisionError):
         return None
     return number if np.isfinite(number) and number > 0 else None
-
-
-def _draft(image: Any, max_side: int) -> None:
-    """Let the JPEG decoder downscale by a power of two where that is exact and still above the working size."""
-    if image.format == "JPEG" and image.mode in ("RGB", "L"):
-        scale = 1
-        while scale < 8 and max(image.size) >= 2 * scale * max_side and all(side % (2 * scale) == 0 for side in image.size):
-            scale *= 2
-        if scale > 1:
-            image.draft(image.mode, (image.size[0] // scale, image.size[1] // scale))
 
 
 def apply_exif_orientation(pixels: np.ndarray, orientation: int) -> np.ndarray:

@@ -59,40 +59,31 @@ class _Made(msgspec.Struct):
 
 def with_foreground_masks(job: Job, capture: Capture, warn: Any) -> Capture:
     """The capture with a silhouette of the foreground as the mask of each photograph that has a trustworthy one. Raises UsageError, BadInput."""
-    _refuse_other_masks(capture.photos)
+    own = [photo.camera.name for photo in capture.photos if photo.mask is not None or has_alpha(photo)]
+    if own:
+        text = f"--mask {FOREGROUND}: {len(own)} of {len(capture.photos)} photographs have a mask or an alpha channel already: {abbreviated(own)}."
+        raise UsageError(f"{text} Omit --mask to use these, or remove them.")
     capture, images = _pictures(job, capture, warn)
     folder = job.work / "foreground"
     folder.mkdir(exist_ok=True)
     made = noted(folder / "made.json", _Made, job.warn)
     if made is None:
-        made = _made_anew(job, capture, images, folder)
+        found: list[_Made] = []
+
+        @compiling_kernels
+        def make(job: Job) -> None:
+            refuse_what_does_not_fit(job, first_training_needed(len(images)), "Omit --mask foreground.")
+            field = first_field(job, capture, images)
+            found.append(_made(job, capture, field, _subject(field), folder))
+
+        make(job)
+        made = found[0]
         note(folder / "made.json", msgspec.to_builtins(made), [folder / file for file in made.masks.values()])
     masks = {name: folder / file for name, file in made.masks.items()}
     job.say(f"foreground silhouettes: {len(masks)} of {len(capture.photos)} photographs, overlap with their visual hull {made.facts['overlap']:.0%}")
     capture = with_masks(capture, masks)
     _draw(capture.photos, images, PosesOutputs(job.out).silhouettes)
     return replace(capture, facts={**capture.facts, FOREGROUND: made.facts})
-
-
-def _made_anew(job: Job, capture: Capture, images: list[np.ndarray], folder: Path) -> _Made:
-    """Masks in the folder, by a first training. Raises BadInput."""
-    found: list[_Made] = []
-
-    @compiling_kernels
-    def make(job: Job) -> None:
-        refuse_what_does_not_fit(job, first_training_needed(len(images)), "Omit --mask foreground.")
-        field = first_field(job, capture, images)
-        found.append(_made(job, capture, field, _subject(field), folder))
-
-    make(job)
-    return found[0]
-
-
-def _refuse_other_masks(photos: Sequence[Photo]) -> None:
-    own = [photo.camera.name for photo in photos if photo.mask is not None or has_alpha(photo)]
-    if own:
-        text = f"--mask {FOREGROUND}: {len(own)} of {len(photos)} photographs have a mask or an alpha channel already: {abbreviated(own)}."
-        raise UsageError(f"{text} Omit --mask to use these, or remove them.")
 
 
 def _pictures(job: Job, capture: Capture, warn: Any) -> tuple[Capture, list[np.ndarray]]:

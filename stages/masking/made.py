@@ -37,7 +37,13 @@ def made_masks(paths: Mapping[str, Path], how: str, folder: Path, **callables: U
 
 def masks_by_network(paths: Mapping[str, Path], model: Path, folder: Path, **callables: Unpack[Callables]) -> dict[str, Path]:
     """The same of photographs in which a network finds a subject. Raises UsageError and BadInput."""
-    return _all_made(paths, _by_network(model), folder, f"--mask-model {model.name}", "subject", **callables)
+    network = MaskNetwork(model)
+
+    def make(photo: DecodedPhoto, path: Path) -> np.ndarray | None:
+        mask = network.mask(photo.rgb)
+        return None if mask is None else sharpened(mask, photo.rgb)
+
+    return _all_made(paths, make, folder, f"--mask-model {model.name}", "subject", **callables)
 
 
 def _all_made(paths: Mapping[str, Path], make: Make, folder: Path, option: str, what: str, **callables: Unpack[Callables]) -> dict[str, Path]:
@@ -61,16 +67,6 @@ def _all_made(paths: Mapping[str, Path], make: Make, folder: Path, option: str, 
     if without:
         callables["warn"](f"{option}: no {what} in {len(without)} of {len(names)} photographs, such as {without[0]}; they get no mask", images=without)
     return found
-
-
-def _by_network(model: Path) -> Make:
-    network = MaskNetwork(model)
-
-    def make(photo: DecodedPhoto, path: Path) -> np.ndarray | None:
-        mask = network.mask(photo.rgb)
-        return None if mask is None else sharpened(mask, photo.rgb)
-
-    return make
 
 
 def _by_key(how: str) -> Make:

@@ -40,7 +40,11 @@ def cameras_of_photographs(job: Job, reader: PhotoReader, warn: Any) -> Capture:
     """The capture of the job's photographs and videos. Raises BadInput."""
     found = photographs_of(job, warn)
     paths, settings = found.paths, job.settings
-    sizes = _sizes(job, paths)
+    sizes = {}
+    for name, path in paths.items():
+        job.safe_point()
+        with contextlib.suppress(UnreadableImage):  # reported where it is read
+            sizes[name] = read_header(path).size
     markers = None if settings.marker_size == "off" else find_markers(job, {name: (paths[name], size) for name, size in sizes.items()})
     find = _search(job, paths, reader, warn, [*sizes.values()], markers)
     given, inverted = kept_white(job, paths, found.masks, reader)
@@ -124,16 +128,6 @@ def mask_choice(settings: Any, provenance: Provenance) -> str:
     """The meaning of masks: those made of a background, or by a network, are silhouettes."""
     made = settings.mask_from not in ("auto", "off") or settings.mask_model != "off" or provenance.background in ("left out", "white")
     return "silhouette" if made and settings.masks == "auto" else str(settings.masks)
-
-
-def _sizes(job: Job, paths: Mapping[str, Path]) -> dict[str, tuple[int, int]]:
-    """Of the photographs that can be read."""
-    sizes = {}
-    for name, path in paths.items():
-        job.safe_point()
-        with contextlib.suppress(UnreadableImage):  # reported where it is read
-            sizes[name] = read_header(path).size
-    return sizes
 
 
 def _search(

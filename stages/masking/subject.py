@@ -108,21 +108,16 @@ def coverage(m: Model, subject: Subject, camera: Camera, near: float, far: float
     with torch.no_grad():
         for begin in range(0, len(chosen), RAYS_PER_BLOCK):
             index = chosen[begin : begin + RAYS_PER_BLOCK]
-            found[index] = _coverage(m, subject, camera, index, near, far)
+            o, d = rays(camera, np.stack([index % camera.width + 0.5, index // camera.width + 0.5], axis=-1))
+            o, slant = np.broadcast_to(o, d.shape), np.maximum(d @ camera.forward, 1e-3)
+            origins, directions, first, last = (torch.tensor(part, dtype=torch.float32) for part in (o, d, near / slant, far / slant))
+            out = render_rays(m, origins, directions, first, last, torch.full_like(first, 0.5), m.behind(directions))
+            ray = ray_of_sample(out.fine.first, len(out.fine.start)).numpy()
+            weight, middle = out.fine_weight.double().numpy(), (out.fine.start + out.fine.extent / 2).double().numpy()
+            heavy = np.flatnonzero(weight > LEAST_WEIGHT)
+            ray, weight, middle = ray[heavy], weight[heavy], middle[heavy]
+            found[index] = np.bincount(ray, weight * subject.holds(o[ray] + middle[:, None] * d[ray]), len(index))
     return found.reshape(camera.height, camera.width)
-
-
-def _coverage(m: Model, subject: Subject, camera: Camera, index: np.ndarray, near: float, far: float) -> np.ndarray:
-    """(R,) `coverage` of these pixels (R,)."""
-    o, d = rays(camera, np.stack([index % camera.width + 0.5, index // camera.width + 0.5], axis=-1))
-    o, slant = np.broadcast_to(o, d.shape), np.maximum(d @ camera.forward, 1e-3)
-    origins, directions, first, last = (torch.tensor(part, dtype=torch.float32) for part in (o, d, near / slant, far / slant))
-    out = render_rays(m, origins, directions, first, last, torch.full_like(first, 0.5), m.behind(directions))
-    ray = ray_of_sample(out.fine.first, len(out.fine.start)).numpy()
-    weight, middle = out.fine_weight.double().numpy(), (out.fine.start + out.fine.extent / 2).double().numpy()
-    heavy = np.flatnonzero(weight > LEAST_WEIGHT)
-    ray, weight, middle = ray[heavy], weight[heavy], middle[heavy]
-    return np.bincount(ray, weight * subject.holds(o[ray] + middle[:, None] * d[ray]), len(index))
 
 
 def may_show(subject: Subject, camera: Camera) -> np.ndarray:

@@ -116,7 +116,12 @@ def _views(capture: Capture, written: Sequence[Any], splits: Sequence[str], fram
 def read(job: Job, settings: PosesSettings, reader: PhotoReader, warn: Any) -> Capture:
     """The capture of the job's source, by structure from motion where the format states no cameras. Raises BadInput."""
     assert job.source is not None
-    possible = _formats(job, settings)
+    possible: list[str] = []
+    for path in job.sources.values():
+        possible = importers.formats_of(path, settings)
+        if len(job.sources) > 1 and possible[0] != "photographs":
+            remedy = "Give it alone, or use --as photographs to find all cameras anew."
+            raise BadInput(f"{path}: is read as {possible[0]}; several sources can only be photographs and videos. {remedy}")
     name = possible[0]
     if len(possible) > 1 and possible[1:] != ["photographs"]:
         warn(f"{job.source} is read as {name}; it could also be {', '.join(possible[1:])}. Choose with --as.")
@@ -137,17 +142,6 @@ def read(job: Job, settings: PosesSettings, reader: PhotoReader, warn: Any) -> C
         which = abbreviated([f"{image} ({why})" for image, why in capture.rejected])
         raise BadInput(f"{job.source}: {len(capture.rejected)} images cannot be used: {which}. Refused by --strict.")
     return capture
-
-
-def _formats(job: Job, settings: PosesSettings) -> list[str]:
-    """The formats that the source can be read as, best first; of several sources photographs alone. Raises BadInput."""
-    found: list[str] = []
-    for path in job.sources.values():
-        found = importers.formats_of(path, settings)
-        if len(job.sources) > 1 and found[0] != "photographs":
-            remedy = "Give it alone, or use --as photographs to find all cameras anew."
-            raise BadInput(f"{path}: is read as {found[0]}; several sources can only be photographs and videos. {remedy}")
-    return found
 
 
 def with_mask_use(job: Job, capture: Capture, reader: PhotoReader, warn: Any) -> tuple[Capture, MaskUse]:

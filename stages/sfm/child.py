@@ -46,19 +46,15 @@ def main() -> None:
             value = TASKS[request["task"]](request["arguments"], progress=channel.progress, safe_point=channel.safe_point, warn=channel.warn)
     except BaseException as error:
         if not any(isinstance(each, Stopped) for each in history(error)):  # COLMAP wraps it where it passes through a callback
-            _send_error(channel, error)
+            facts: dict[str, Any] = {"type": type(error).__name__, "text": str(error), "errno": None, "strerror": None, "filename": None}
+            if isinstance(error, OSError):
+                name = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else None
+                facts |= {"errno": error.errno, "strerror": error.strerror, "filename": name}
+            channel.send({"event": "error", **facts, "traceback": "".join(traceback.format_exception(error))})
     else:
         channel.send({"event": "result", "value": value})
     sys.stderr.flush()
     os._exit(0)  # libraries that take the process down while they are unloaded have no say
-
-
-def _send_error(channel: _Channel, error: BaseException) -> None:
-    facts: dict[str, Any] = {"type": type(error).__name__, "text": str(error), "errno": None, "strerror": None, "filename": None}
-    if isinstance(error, OSError):
-        name = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else None
-        facts |= {"errno": error.errno, "strerror": error.strerror, "filename": name}
-    channel.send({"event": "error", **facts, "traceback": "".join(traceback.format_exception(error))})
 
 
 if __name__ == "__main__":

@@ -82,7 +82,17 @@ def put(database: Path, made: Mapping[int, str]) -> None:
         for image, rows in rows_of(database, FEATURES, made):
             data = msgspec.msgpack.encode(rows)
             write_atomically(cache / f"{made[image]}{SUFFIX}", hashlib.sha256(data).digest() + data, durable=False)
-        _prune(cache)
+        # Remove the least recently used files beyond the limit.
+        kept, most, listed = 0, max_bytes(), []
+        for path in cache.glob(f"*{SUFFIX}"):
+            with contextlib.suppress(FileNotFoundError):  # another process has removed it
+                about = path.lstat()
+                listed.append((about.st_mtime, about.st_size, path))
+        for _, size, path in sorted(listed, reverse=True):
+            kept += size
+            if kept > most:
+                with contextlib.suppress(OSError):
+                    remove(path)
     except OSError:
         return
 
@@ -103,20 +113,6 @@ def _read(path: Path) -> list[Row] | None:
         with contextlib.suppress(OSError):
             remove(path)
         return None
-
-
-def _prune(cache: Path) -> None:
-    """Remove the least recently used files beyond `max_bytes`."""
-    kept, most, listed = 0, max_bytes(), []
-    for path in cache.glob(f"*{SUFFIX}"):
-        with contextlib.suppress(FileNotFoundError):  # another process has removed it
-            about = path.lstat()
-            listed.append((about.st_mtime, about.st_size, path))
-    for _, size, path in sorted(listed, reverse=True):
-        kept += size
-        if kept > most:
-            with contextlib.suppress(OSError):
-                remove(path)
 
 
 def _sha256(data: bytes) -> str:

@@ -67,7 +67,12 @@ def prepare_images(
     """
     safe_point, warn, reader = callables["safe_point"], callables["warn"], PhotoReader(copies or work / "photographs")
     request: dict[str, object] = {"layout": LAYOUT, "max_side": max_side, "features": features, "seed": seed, "lens": lens}
-    request["photographs"] = _digests(paths, masks, safe_point)
+    rows: list[list[str | None]] = []
+    for name in sorted(paths):
+        safe_point()
+        mask = masks.get(name)
+        rows.append([name, _sha256(paths[name]), _sha256(mask) if mask is not None else NO_MASK if name in masks else None])
+    request["photographs"] = rows
     _begin(work, json.dumps(request, indent=1, sort_keys=True).encode())
     ordered = sorted(paths)
     copied = in_order(
@@ -97,15 +102,6 @@ def _begin(work: Path, request: bytes) -> None:
         for part in parts:
             part.mkdir()
         write_atomically(record, request, durable=False)
-
-
-def _digests(paths: Mapping[str, Path], masks: Masks, safe_point: SafePoint) -> list[list[str | None]]:
-    rows: list[list[str | None]] = []
-    for name in sorted(paths):
-        safe_point()
-        mask = masks.get(name)
-        rows.append([name, _sha256(paths[name]), _sha256(mask) if mask is not None else NO_MASK if name in masks else None])
-    return rows
 
 
 def _copy(name: str, path: Path, index: int, max_side: int, masks: Masks, lens: str, work: Path, reader: PhotoReader) -> tuple[WorkImage | None, str]:

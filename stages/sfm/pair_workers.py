@@ -84,7 +84,15 @@ def match_for(arguments: Mapping[str, Any], *, progress: Callable[..., None], sa
     names = _make_database(work, scratch)
     for position, block in enumerate(arguments["blocks"]):
         safe_point()
-        _take_features(work, scratch, sorted({image for pair in block for image in pair}))
+        # The features of the block's images take the place of all that is in the database.
+        images = sorted({image for pair in block for image in pair})
+        marks = ", ".join("?" * len(images))
+        with contextlib.closing(attached(scratch, work)) as connection, connection:
+            for table, _ in PAIRS:
+                connection.execute(f"DELETE FROM {table}")
+            for table, column in FEATURES:
+                connection.execute(f"DELETE FROM {table}")
+                connection.execute(f"INSERT INTO {table} SELECT * FROM everything.{table} WHERE {column} IN ({marks})", images)
         match_block(database_path(scratch), scratch / "pairs.txt", [(i, j) for i, j in block], names, arguments["seed"], arguments["guided"])
         progress(position)
     safe_point()
@@ -119,14 +127,3 @@ def _make_database(work: Path, scratch: Path) -> dict[int, str]:
                 connection.execute(f"DELETE FROM {table}")
                 connection.execute(f"INSERT INTO {table} SELECT * FROM everything.{table}")
         return dict(connection.execute("SELECT image_id, name FROM images"))
-
-
-def _take_features(work: Path, scratch: Path, images: Sequence[int]) -> None:
-    """Put the features of these images in the place of all that is in the database."""
-    marks = ", ".join("?" * len(images))
-    with contextlib.closing(attached(scratch, work)) as connection, connection:
-        for table, _ in PAIRS:
-            connection.execute(f"DELETE FROM {table}")
-        for table, column in FEATURES:
-            connection.execute(f"DELETE FROM {table}")
-            connection.execute(f"INSERT INTO {table} SELECT * FROM everything.{table} WHERE {column} IN ({marks})", images)

@@ -90,8 +90,16 @@ class Budget:
         now = self.seconds
         if self.timed is None and (self.known or step >= min(self.warmup, self.schedule.hold - 1)):
             self.timed = step, now
-        if not self._due(step, now):
+        passed = [mark for mark in self.marks if mark <= now]
+        if not self.known:
+            due = step >= self.schedule.hold or now >= self.budget
+        else:  # a resumed run takes steps again for which the schedule was made
+            enough = bool(passed) and self.timed is not None and step - self.timed[0] >= MIN_TIMED
+            # After the last mark other work may slow the steps that are left: none is taken once the budget is over.
+            due = (enough or now >= self.budget) and self.schedule.revised_at < step < self.schedule.iterations
+        if not due:
             return False
+        self.marks = self.marks[len(passed) :]
         iterations = step
         if now < self.budget:
             # An attempt may have begun just before the number is due; then all steps are timed, slow ones of the beginning too.
@@ -102,19 +110,6 @@ class Budget:
         self.timed = step, now
         self.written(self.schedule)
         return True
-
-    def _due(self, step: int, now: float) -> bool:
-        """Whether the number of iterations is to be set after this step."""
-        passed = [mark for mark in self.marks if mark <= now]
-        if not self.known:
-            due = step >= self.schedule.hold or now >= self.budget
-        else:  # a resumed run takes steps again for which the schedule was made
-            enough = bool(passed) and self.timed is not None and step - self.timed[0] >= MIN_TIMED
-            # After the last mark other work may slow the steps that are left: none is taken once the budget is over.
-            due = (enough or now >= self.budget) and self.schedule.revised_at < step < self.schedule.iterations
-        if due:
-            self.marks = self.marks[len(passed) :]
-        return due
 
 
 def training_budget(

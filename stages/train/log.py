@@ -114,38 +114,31 @@ class TrainLog(Log):
         if due or psnr is not None or not self.rates:
             self.fraction = self.occupied()
         if due or psnr is not None:
-            self.add(self._line(done, seconds, psnr))
+            self.add({
+                "step": done.step,
+                "seconds": round(seconds, 3),
+                "step_seconds": round(self.working / (done.step - self.logged), 6),
+                "loss": self.loss,
+                "psnr": psnr_of(self.loss),
+                "preview_psnr": psnr,
+                "rays": done.rays,
+                "tried": done.tried,
+                "valid": done.valid,
+                "pivotal": done.pivotal,
+                "fine": done.fine,
+                "left_out": done.left_out,
+                "occupied": self.fraction,
+            })
             self.working, self.logged = 0.0, done.step
         if due or not self.rates:
-            self.rates = self._rates(done, goal, seconds)
+            # By the last steps of this attempt. Its first step says nothing of those to come: kernels are loaded in it.
+            self.recent.append((done.step, seconds))
+            step, began = self.recent[0]
+            self.rates = {"occupied": round(self.fraction, 4)}
+            if done.step > step:
+                each = max((seconds - began) / (done.step - step), 1e-9)
+                self.rates |= {"samples_per_s": round((done.valid + done.fine) / each), "left": round(each * max(0, goal - done.step), 1)}
         return {"loss": self.loss, "psnr": round(psnr_of(self.loss), 2), **self.rates}
-
-    def _rates(self, done: Progress, goal: int, seconds: float) -> dict[str, Any]:
-        """By the last steps of this attempt. Its first step says nothing of those to come: kernels are loaded in it."""
-        self.recent.append((done.step, seconds))
-        step, began = self.recent[0]
-        rates: dict[str, Any] = {"occupied": round(self.fraction, 4)}
-        if done.step > step:
-            each = max((seconds - began) / (done.step - step), 1e-9)
-            rates |= {"samples_per_s": round((done.valid + done.fine) / each), "left": round(each * max(0, goal - done.step), 1)}
-        return rates
-
-    def _line(self, done: Progress, seconds: float, psnr: float | None) -> dict[str, Any]:
-        return {
-            "step": done.step,
-            "seconds": round(seconds, 3),
-            "step_seconds": round(self.working / (done.step - self.logged), 6),
-            "loss": self.loss,
-            "psnr": psnr_of(self.loss),
-            "preview_psnr": psnr,
-            "rays": done.rays,
-            "tried": done.tried,
-            "valid": done.valid,
-            "pivotal": done.pivotal,
-            "fine": done.fine,
-            "left_out": done.left_out,
-            "occupied": self.fraction,
-        }
 
 
 def psnr_of(loss: float) -> float:

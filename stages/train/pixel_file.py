@@ -25,12 +25,6 @@ class PixelFile:
         with tempfile.TemporaryFile(dir=folder, buffering=0) as file:
             self._number = os.dup(file.fileno())
         self._closed = weakref.finalize(self, os.close, self._number)
-        self._reserve()
-        self._advised = hasattr(os, "posix_fadvise")  # not on macOS
-        if self._advised:
-            os.posix_fadvise(self._number, 0, 0, os.POSIX_FADV_RANDOM)
-
-    def _reserve(self) -> None:
         try:
             if hasattr(os, "posix_fallocate"):
                 os.posix_fallocate(self._number, 0, max(1, self.nbytes))
@@ -38,6 +32,9 @@ class PixelFile:
             if error.errno not in UNSUPPORTED:
                 raise
         os.ftruncate(self._number, self.nbytes)
+        self._advised = hasattr(os, "posix_fadvise")  # not on macOS
+        if self._advised:
+            os.posix_fadvise(self._number, 0, 0, os.POSIX_FADV_RANDOM)
 
     @property
     def nbytes(self) -> int:

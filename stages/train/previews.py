@@ -13,7 +13,7 @@ from pipeline.text import printable
 from stages.evaluate.views import ground_truth, stride_to, subsample_camera
 from stages.figures.plots import to_uint8
 from stages.io.png import read_png, write_png
-from stages.io.scene import Scene, View, views_of
+from stages.io.scene import Scene, views_of
 from stages.scratch import Warn, digest_of, once
 
 SIDE = 200  # longest side of a preview, pixels
@@ -35,7 +35,9 @@ class Previews:
         every       steps after which a preview is due; None: none ever is
         """
         self.render, self.background, self.poses, self.work, self.every = render, background, poses, work, every
-        self.view = preview_view(s)
+        # A validation view if there is one, so that the test views stay unread until the end.
+        views = views_of(s, "val") or views_of(s, "test")
+        self.view = views[len(views) // 2] if views else None
         self.figures: dict[str, float] = {}  # PSNR and SSIM of the last preview, the latter where it is large enough
 
     def draw_when_due(self, step: int) -> float | None:
@@ -70,9 +72,3 @@ class Previews:
                 continue
             folder.mkdir(exist_ok=True)
             shutil.copyfile(path, folder / path.name)
-
-
-def preview_view(s: Scene) -> View | None:
-    """A validation view if there is one, so that the test views stay unread until the end; None: there are neither."""
-    views = views_of(s, "val") or views_of(s, "test")
-    return views[len(views) // 2] if views else None

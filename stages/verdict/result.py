@@ -88,7 +88,10 @@ def verdict_on_result(metrics: Mapping[str, Any], cameras: CameraVerdict | None 
     cameras  the verdict on the cameras, where there is one
     """
     figures = _figures(metrics, cameras)
-    strip = _strip(metrics)
+    # The picture of the worst view; without strips the contact sheet.
+    files = {each["which"]: each["file"] for each in metrics["strips"]}
+    name = files.get("worst") or files.get("median")
+    strip = f"{RUN}/{name}" if name else SHEET
     found = [
         *_of_held_out(metrics, figures, cameras, strip),
         *_of_single_views(metrics, figures, strip),
@@ -100,7 +103,10 @@ def verdict_on_result(metrics: Mapping[str, Any], cameras: CameraVerdict | None 
         *_of_splats(metrics, figures),
         *_of_cameras(cameras),
     ]
-    first = "holes" if _mostly_holes(metrics) else None
+    # Where more than half of the asset's squared error is in its holes, these come before its pictures.
+    errors = [10 ** (-view["asset"]["psnr"] / 10) for view in metrics["views"] if view["asset"]["psnr"] is not None]
+    excess = metrics["holes_excess_error"]
+    first = "holes" if errors and excess is not None and excess > 0.5 * statistics.fmean(errors) else None
     ordered = tuple(sorted(found, key=lambda each: (-GRADES.index(each.grade), each.what != first)))
     return ResultVerdict(ordered[0].grade if ordered else "good", ordered, figures)
 
@@ -162,13 +168,6 @@ def grade_of(blur: float, gain: float) -> str:
     if gain < FAILED_GAIN and blur > FAILED_BLUR:
         return "failed"
     return "poor" if blur > POOR_BLUR else "usable" if blur > USABLE_BLUR else "good"
-
-
-def _strip(metrics: Mapping[str, Any]) -> str:
-    """The picture of the worst view; without strips the contact sheet."""
-    files = {each["which"]: each["file"] for each in metrics["strips"]}
-    name = files.get("worst") or files.get("median")
-    return f"{RUN}/{name}" if name else SHEET
 
 
 def _of_held_out(metrics: Mapping[str, Any], figures: Mapping[str, Any], cameras: CameraVerdict | None, strip: str) -> list[ResultProblem]:
@@ -267,13 +266,6 @@ def _of_holes(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:
     remedy = "Keep more voxels (a lower bake.weight_threshold, more bake.visibility_rays), or allow a larger asset (bake.max_mib)."
     usual = ("Voxels that few rays see were left out.", remedy)
     return [ResultProblem("holes", "poor" if holes > MANY_HOLES else "usable", sentence, *(_short(metrics) or usual), strip)]
-
-
-def _mostly_holes(metrics: Mapping[str, Any]) -> bool:
-    """Whether more than half of the asset's squared error is in its holes: then these come before its pictures."""
-    errors = [10 ** (-view["asset"]["psnr"] / 10) for view in metrics["views"] if view["asset"]["psnr"] is not None]
-    excess = metrics["holes_excess_error"]
-    return bool(errors) and excess is not None and excess > 0.5 * statistics.fmean(errors)
 
 
 def _of_floaters(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:

@@ -18,7 +18,7 @@ from stages.io.capture import Capture
 from stages.io.pictures import UnreadableImage, read_quality
 from stages.io.scene import Scene
 from stages.verdict import looks, pictures
-from stages.verdict.verdict import Verdict, verdict_on
+from stages.verdict.verdict import verdict_on
 
 GREY = np.array([0.299, 0.587, 0.114])
 ALREADY_REPORTED = ("not registered", "folded", "parallax", "few")  # problems that the search for cameras has warned of, or that the user knows of
@@ -45,7 +45,13 @@ def judge(job: Job, capture: Capture, scene: Scene, renders: bool, warn: Any) ->
     found = replace(found, figures={**found.figures, "coverage": _coverage(scene)})
     write_json(outputs.verdict, found.document())
     job.safe_point()
-    _draw(outputs, capture, scene, found)
+    lost = [name for name, _ in capture.rejected]
+    names, centres = [view.name for view in scene.views], np.array([view.camera.centre for view in scene.views])
+    forward = np.array([view.camera.world_from_camera[:3, 2] for view in scene.views])
+    points = np.zeros((0, 3)) if capture.points is None else scene.world_from_capture.points(capture.points.xyz)
+    pictures.camera_plot(centres, forward, points, pictures.lost_places(names, centres, lost, capture.overlaps), found.summary(), outputs.cameras)
+    if capture.overlaps:
+        pictures.match_picture(sorted([*names, *lost]), lost, capture.overlaps, outputs.matches)
     job.safe_point()
     sharpness = {name: each.sharpness for name, each in seen.items()}
     pictures.sharpness_sheet(files, sharpness, looks.blurred(seen), outputs.sharpness)
@@ -85,13 +91,3 @@ def _photographs_in_folder(job: Job) -> int | None:
     with contextlib.suppress(BadInput):
         return len(photographs(Source(job.source, job.settings.allow_outside)))
     return None
-
-
-def _draw(outputs: PosesOutputs, capture: Capture, scene: Scene, found: Verdict) -> None:
-    lost = [name for name, _ in capture.rejected]
-    names, centres = [view.name for view in scene.views], np.array([view.camera.centre for view in scene.views])
-    forward = np.array([view.camera.world_from_camera[:3, 2] for view in scene.views])
-    points = np.zeros((0, 3)) if capture.points is None else scene.world_from_capture.points(capture.points.xyz)
-    pictures.camera_plot(centres, forward, points, pictures.lost_places(names, centres, lost, capture.overlaps), found.summary(), outputs.cameras)
-    if capture.overlaps:
-        pictures.match_picture(sorted([*names, *lost]), lost, capture.overlaps, outputs.matches)

@@ -78,7 +78,20 @@ def frames_of(videos: Mapping[str, Path], *, count: int, max_side: int, reader: 
         numbers = [number for number, verdict in zip(found.index, verdicts, strict=True) if verdict == choice.CHOSEN]
         written = _written(name, videos[name], place, numbers, max_side, found, reader)
         paths |= {f"{name}/{number:06d}.png": path for number, path in written.items()}
-        record.append(_record(name, found, verdicts))
+        # columns with an entry for each frame that was looked at
+        record.append({
+            "video": name,
+            "size": [found.width, found.height],
+            "duration": found.duration,
+            "camera": found.maker,
+            "frames": len(found.index),
+            "chosen": verdicts.count(choice.CHOSEN),
+            "frame": found.index,
+            "time": found.time,
+            "sharpness": [round(value, 5) for value in found.sharpness],
+            "motion": [round(value, 5) for value in found.motion],
+            "verdict": verdicts,
+        })
     return Chosen(paths, record)
 
 
@@ -166,20 +179,3 @@ def _write(frame: Frame, path: Path, max_side: int, video: Video, name: str) -> 
     exif = Image.Exif()
     exif[Base.Make] = video.maker or f"video {name}"  # photographs of one maker and size share a camera
     write_png(frame.rgb(max_side), path, compress_level=FAST, durable=False, exif=exif)
-
-
-def _record(name: str, found: FirstReading, verdicts: list[str]) -> dict[str, object]:
-    """A video's entry in frames.json: columns with an entry for each frame that was looked at."""
-    return {
-        "video": name,
-        "size": [found.width, found.height],
-        "duration": found.duration,
-        "camera": found.maker,
-        "frames": len(found.index),
-        "chosen": verdicts.count(choice.CHOSEN),
-        "frame": found.index,
-        "time": found.time,
-        "sharpness": [round(value, 5) for value in found.sharpness],
-        "motion": [round(value, 5) for value in found.motion],
-        "verdict": verdicts,
-    }

@@ -120,7 +120,11 @@ class Video:
             if decoded.is_corrupt:
                 self.damaged += 1
             else:
-                yield Frame(index, time, decoded, self._upright_size(decoded), self._matrix or (1, 0, 0, 1))
+                if self._matrix is None:
+                    self._matrix = _display_matrix(decoded)
+                    wide = (max(1, round(decoded.width * self._aspect)), decoded.height)  # square pixels
+                    self.width, self.height = wide if self._matrix[0] else wide[::-1]
+                yield Frame(index, time, decoded, (self.width, self.height), self._matrix or (1, 0, 0, 1))
             if index + 1 >= MAX_FRAMES:
                 return
 
@@ -140,13 +144,6 @@ class Video:
         except av.error.FFmpegError:  # the file ends, or makes no sense from here on
             self.damaged += 1
 
-    def _upright_size(self, decoded: Any) -> tuple[int, int]:
-        if self._matrix is None:
-            self._matrix = _display_matrix(decoded)
-            wide = (max(1, round(decoded.width * self._aspect)), decoded.height)  # square pixels
-            self.width, self.height = wide if self._matrix[0] else wide[::-1]
-        return self.width, self.height
-
 
 @contextmanager
 def opened(path: Path, threads: int = 1) -> Iterator[Video]:
@@ -160,7 +157,14 @@ def opened(path: Path, threads: int = 1) -> Iterator[Video]:
             file.seek(0)
             limits = {"max_pixels": str(MAX_PIXELS)}
             with av.open(file, "r", format=name, options=limits, buffer_size=_BUFFER, **_TOLERANT) as container:
-                stream = _pictures(container)
+                # the largest stream of pictures that is no cover
+                streams = [each for each in container.streams.video if not each.disposition & Disposition.attached_pic and each.codec_context is not None]
+                if not streams:
+                    raise UnreadableVideo("unreadable: no stream of pictures in it")
+                stream = max(streams, key=lambda each: (each.codec_context.width * each.codec_context.height, -each.index))
+                width, height = stream.codec_context.width, stream.codec_context.height
+                if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
+                    raise UnreadableVideo(f"unreadable: {width}x{height} pixels; at most {MAX_SIDE} a side and {MAX_PIXELS // 10**6} million in all are read")
                 stream.codec_context.options = limits
                 stream.codec_context.thread_count, stream.codec_context.thread_type = threads, "AUTO"
                 yield Video(container, stream)
@@ -179,18 +183,6 @@ def _format(head: bytes) -> str:
     if head[:4] == b"RIFF" and head[8:12] == b"AVI ":
         return "avi"
     raise UnreadableVideo(f"unreadable: no video in a format that is read ({KNOWN}), or damaged at its start")
-
-
-def _pictures(container: Any) -> Any:
-    """The largest stream of pictures that is no cover."""
-    streams = [each for each in container.streams.video if not each.disposition & Disposition.attached_pic and each.codec_context is not None]
-    if not streams:
-        raise UnreadableVideo("unreadable: no stream of pictures in it")
-    stream = max(streams, key=lambda each: (each.codec_context.width * each.codec_context.height, -each.index))
-    width, height = stream.codec_context.width, stream.codec_context.height
-    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
-        raise UnreadableVideo(f"unreadable: {width}x{height} pixels; at most {MAX_SIDE} a side and {MAX_PIXELS // 10**6} million in all are read")
-    return stream
 
 
 def _display_matrix(decoded: Any) -> tuple[int, int, int, int]:

@@ -153,11 +153,6 @@ def check(
         kind, shape = "int32" if name == "visits" else "float32", (count, 3 * tree.harmonics_count) if name == "sh" else (count,)
         if name not in found or found[name].dtype != kind or found[name].shape != shape:
             raise ValueError(f"'{name}' is missing, or no {kind} {shape}")
-    return about, _schedule_of(about, stated, hold), kept
-
-
-def _schedule_of(about: _About, stated: RefinementSchedule, hold: int | None) -> RefinementSchedule:
-    """The schedule that the checkpoint was written with; ValueError where it is none of this refinement, or the step is not one of the phase."""
     if (about.pruned is None) == (about.phase == 1):
         raise ValueError(f"what was dropped up to phase {about.phase} is not what is dropped there")
     if hold is None:
@@ -171,4 +166,4 @@ def _schedule_of(about: _About, stated: RefinementSchedule, hold: int | None) ->
     low, high = schedule.begin(about.phase), schedule.begin(about.phase + 1)
     if not low <= about.step <= high:
         raise ValueError(f"step {about.step} is not from {low} to {high}")
-    return schedule
+    return about, schedule, kept

@@ -39,21 +39,6 @@ def gltf_from_capture(up: np.ndarray) -> np.ndarray:
     return np.eye(3) + axis + axis @ axis / (1 + y)
 
 
-def source_extras(frame: SourceFrame) -> dict[str, Any]:
-    """The extras of a node that say which frame it comes from."""
-    rotation = np.eye(4)
-    rotation[:3, :3] = gltf_from_capture(frame.up)
-    recorded = frame.world_from_capture
-    return {
-        "source_frame": {
-            "gltf_from_capture": (rotation + 0.0).tolist(),  # rows
-            "capture_up": (frame.up + 0.0).tolist(),
-            "unit": frame.unit,
-            "world_from_capture": {"scale": recorded.scale, "rotation": recorded.rotation.tolist(), "translation": recorded.translation.tolist()},
-        }
-    }
-
-
 @dataclass
 class Buffer:
     """The binary part as it grows, and the document's lists about it."""
@@ -93,12 +78,20 @@ def write_document(
     name: str, primitive: dict[str, Any], extension: str, frame: SourceFrame, buffer: Buffer, path: Path, more: dict[str, Any] | None = None
 ) -> None:
     """Write one node with one primitive, whose data are in the buffer. `more`: of the document, as materials."""
+    rotation, recorded = np.eye(4), frame.world_from_capture
+    rotation[:3, :3] = gltf_from_capture(frame.up)
+    source_frame = {
+        "gltf_from_capture": (rotation + 0.0).tolist(),  # rows
+        "capture_up": (frame.up + 0.0).tolist(),
+        "unit": frame.unit,
+        "world_from_capture": {"scale": recorded.scale, "rotation": recorded.rotation.tolist(), "translation": recorded.translation.tolist()},
+    }
     document = {
         "asset": {"version": "2.0", "generator": "efficientnerf"},
         "extensionsUsed": [extension],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": name, "mesh": 0, "extras": source_extras(frame)}],
+        "nodes": [{"name": name, "mesh": 0, "extras": {"source_frame": source_frame}}],
         "meshes": [{"name": name, "primitives": [primitive]}],
         **(more or {}),
         "accessors": buffer.accessors, "bufferViews": buffer.views, "buffers": [{"byteLength": buffer.size}],

@@ -168,7 +168,15 @@ class _Tree:
         mask = np.zeros((len(self.leaves), 8**LEAF), bool)
         mask[np.repeat(np.arange(len(self.leaves)), np.diff(self.first, append=len(place))), place & 8**LEAF - 1] = True
         self.masks = np.packbits(mask, axis=1, bitorder="little")  # (L, 64)
-        self.head = struct.pack("<I", ACTIVE_VALUES) + self._metadata(at) + _text("AffineMap") + np.ascontiguousarray(grid.matrix.T, "<f8").tobytes()
+        entries = {
+            "class": ("string", b"unknown" if self.vector else b"fog volume"),
+            "file_bbox_max": ("vec3i", at.max(axis=0).astype("<i4").tobytes()),
+            "file_bbox_min": ("vec3i", at.min(axis=0).astype("<i4").tobytes()),
+            "file_voxel_count": ("int64", struct.pack("<q", len(at))),
+            "is_saved_as_half_float": ("bool", bytes([self.half])),
+            "name": ("string", self.name.encode("ascii")),
+        }
+        self.head = struct.pack("<I", ACTIVE_VALUES) + _table(entries) + _text("AffineMap") + np.ascontiguousarray(grid.matrix.T, "<f8").tobytes()
         self.lower, self.upper = np.unique(self.leaves >> 3 * LOWER), np.unique(self.leaves >> 3 * (LOWER + UPPER))
         background = 12 if self.vector else 4
         nodes = sum(len(there) * (2 * 8**side // 8 + 1) for there, side in ((self.lower, LOWER), (self.upper, UPPER)))
@@ -178,17 +186,6 @@ class _Tree:
     def descriptor(self) -> bytes:
         kind = f"Tree_{'vec3s' if self.vector else 'float'}_{UPPER}_{LOWER}_{LEAF}{'_HalfFloat' if self.half else ''}"
         return _text(self.name) + _text(kind) + _text("")
-
-    def _metadata(self, at: np.ndarray) -> bytes:
-        entries = {
-            "class": ("string", b"unknown" if self.vector else b"fog volume"),
-            "file_bbox_max": ("vec3i", at.max(axis=0).astype("<i4").tobytes()),
-            "file_bbox_min": ("vec3i", at.min(axis=0).astype("<i4").tobytes()),
-            "file_voxel_count": ("int64", struct.pack("<q", len(at))),
-            "is_saved_as_half_float": ("bool", bytes([self.half])),
-            "name": ("string", self.name.encode("ascii")),
-        }
-        return _table(entries)
 
     def topology(self) -> Iterator[bytes]:
         """Which nodes there are: a node's own, then those of its children, each in turn."""

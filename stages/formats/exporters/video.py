@@ -40,7 +40,17 @@ def write_mp4(frames: Iterable[np.ndarray], path: Path, *, fps: int, crf: int = 
                 stream.width, stream.height = size[1] + size[1] % 2, size[0] + size[0] % 2
             if frame.shape != size:
                 raise ValueError(f"{path}: frame {count} has shape {frame.shape}, the first has {size}")
-            video_frame = _yuv(frame)
+            # Rec. 709 YCbCr 4:2:0, studio range, padded to even sides
+            height, width = frame.shape[:2]
+            even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+            video_frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24").reformat(
+                format="yuv420p",
+                src_color_range=ColorRange.JPEG,
+                dst_colorspace=Colorspace.ITU709,
+                dst_color_range=ColorRange.MPEG,
+                interpolation=Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.BITEXACT,
+                threads=1,
+            )
             # Not the stream's time base: the container changes that when it writes its header.
             video_frame.pts, video_frame.time_base = count, Fraction(1, fps)
             container.mux(stream.encode(video_frame))
@@ -49,17 +59,3 @@ def write_mp4(frames: Iterable[np.ndarray], path: Path, *, fps: int, crf: int = 
             raise ValueError(f"{path}: a video of no frames")
         container.mux(stream.encode())
     return count
-
-
-def _yuv(frame: np.ndarray) -> av.VideoFrame:
-    """The frame in Rec. 709 YCbCr 4:2:0, studio range, padded to even sides."""
-    height, width = frame.shape[:2]
-    even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-    return av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24").reformat(
-        format="yuv420p",
-        src_color_range=ColorRange.JPEG,
-        dst_colorspace=Colorspace.ITU709,
-        dst_color_range=ColorRange.MPEG,
-        interpolation=Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.BITEXACT,
-        threads=1,
-    )

@@ -47,7 +47,11 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
     files = _files(source, place)
     model = read_model(place, files)
     where = source.name_of(place) if place != source.root else source.root.name
-    images = _image_folder(source, model)
+    # The folder in which most of the model's names are found, the first of equals.
+    names = [image.name for image in model.images.values()]
+    places = [Path(os.path.normpath(base / place)) for place in _IMAGE_PLACES for base in (source.root, model.folder, model.folder.parent)]
+    candidates = [path for path in dict.fromkeys(places) if path.is_dir() and path.is_relative_to(source.root)]
+    images = max(candidates, key=lambda folder: sum(os.path.isfile(folder / name) for name in names))
     frames = [
         Frame(image.name, images, f"{where}: {printable(image.name, MAX_NAME)}", _camera(model, image, where), own=number)
         for number, image in sorted(model.images.items(), key=lambda item: item[1].name)
@@ -71,14 +75,6 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
 def _camera(model: Model, image: PosedImage, where: str) -> CameraOf:
     lens, pose = model.cameras[image.camera], pose_from_colmap(np.array(image.quaternion), np.array(image.translation))
     return lambda name, size: lenses.validated(replace(lens, name=name, world_from_camera=pose), f"{where}: camera {image.camera}")
-
-
-def _image_folder(source: Source, model: Model) -> Path:
-    """The folder in which most of the model's names are found, the first of equals."""
-    names = [image.name for image in model.images.values()]
-    places = [Path(os.path.normpath(base / place)) for place in _IMAGE_PLACES for base in (source.root, model.folder, model.folder.parent)]
-    candidates = [path for path in dict.fromkeys(places) if path.is_dir() and path.is_relative_to(source.root)]
-    return max(candidates, key=lambda folder: sum(os.path.isfile(folder / name) for name in names))
 
 
 def _points(files: Sequence[Path], places: dict[int, int]) -> SparsePoints | None:

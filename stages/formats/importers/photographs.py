@@ -57,7 +57,23 @@ def photographs(source: Source) -> list[Path]:
 
     Raises BadInput.
     """
-    return _without_twins(source, _all(source))
+    found = _all(source)
+    named: dict[tuple[Path, str], list[Path]] = {}
+    for path in found:
+        named.setdefault((path.parent, name_key(path.stem)), []).append(path)
+    left: dict[Path, Path] = {}
+    for same in named.values():
+        kept: list[Path] = []
+        for path in sorted(same, key=lambda path: _preference(source, path)) if len(same) > 1 else ():
+            twin = next((other for other in kept if _is_same_picture(source.real(path), source.real(other))), None)
+            if twin is None:
+                kept.append(path)
+            else:
+                left[path] = twin
+    if left:
+        pairs = abbreviated([f"{source.name_of(path)} is {source.name_of(twin)}" for path, twin in sorted(left.items())])
+        source.remarks[f"{source.root}: {len(left)} pictures lie there twice, in two formats, and are read once ({pairs})."] = None
+    return [path for path in found if path not in left]
 
 
 def _all(source: Source) -> list[Path]:
@@ -69,7 +85,10 @@ def _all(source: Source) -> list[Path]:
     else:
         everything = source.walk()
         usable = [path for path in everything if not _is_by_product(path, folder)]
-        found = _corrected_once(_without_maps(one_of_each(sorted(path for path in usable if path.suffix.lower() in IMAGE_SUFFIXES))))
+        # Without those in a folder images/ that lie in corrected_images/ next to it, too, as Polycam writes them.
+        images = _without_maps(one_of_each(sorted(path for path in usable if path.suffix.lower() in IMAGE_SUFFIXES)))
+        corrected = {(path.parent.parent, path.name) for path in images if path.parent.name == CORRECTED}
+        found = [path for path in images if path.parent.name != "images" or (path.parent.parent, path.name) not in corrected]
         videos = files_in(folder, SUFFIXES) or sorted(filter(is_video, usable))
         if not found and not videos:
             raise BadInput(_nothing(source, everything))
@@ -81,12 +100,6 @@ def _all(source: Source) -> list[Path]:
     if len(found) > MAX_FRAMES:
         raise BadInput(f"{folder}: {len(found)} images; at most {MAX_FRAMES} are read.")
     return [source.check_inside(path) for path in found]
-
-
-def _corrected_once(images: Sequence[Path]) -> list[Path]:
-    """Without those in a folder images/ that lie in corrected_images/ next to it, too, as Polycam writes them."""
-    corrected = {(path.parent.parent, path.name) for path in images if path.parent.name == CORRECTED}
-    return [path for path in images if path.parent.name != "images" or (path.parent.parent, path.name) not in corrected]
 
 
 def _without_maps(images: Sequence[Path]) -> list[Path]:
@@ -120,26 +133,6 @@ def _remark_on_others(source: Source, found: Sequence[Path]) -> None:
             f"{folder}: {count} in other folders ({abbreviated(names)}) {'are' if len(others) > 1 else 'is'} not read, for {len(found)} lie directly in "
             f"{here.name if here != folder else 'it'}. Name the folders as sources of their own, or put the photographs together."
         ] = None
-
-
-def _without_twins(source: Source, found: Sequence[Path]) -> list[Path]:
-    """One of each picture that is there in several formats; the source's remarks list the others."""
-    named: dict[tuple[Path, str], list[Path]] = {}
-    for path in found:
-        named.setdefault((path.parent, name_key(path.stem)), []).append(path)
-    left: dict[Path, Path] = {}
-    for same in named.values():
-        kept: list[Path] = []
-        for path in sorted(same, key=lambda path: _preference(source, path)) if len(same) > 1 else ():
-            twin = next((other for other in kept if _is_same_picture(source.real(path), source.real(other))), None)
-            if twin is None:
-                kept.append(path)
-            else:
-                left[path] = twin
-    if left:
-        pairs = abbreviated([f"{source.name_of(path)} is {source.name_of(twin)}" for path, twin in sorted(left.items())])
-        source.remarks[f"{source.root}: {len(left)} pictures lie there twice, in two formats, and are read once ({pairs})."] = None
-    return [path for path in found if path not in left]
 
 
 def _preference(source: Source, path: Path) -> tuple[bool, int, Path]:

@@ -202,21 +202,17 @@ class Source:
         if os.path.isfile(path):
             return self.check_inside(path)
         stem = path.stem if path.suffix.lower() in suffixes else path.name
-        usable = [other for other in self._folder(path.parent).get(name_key(stem), []) if other.suffix.lower() in suffixes]
+        if path.parent not in self._folders:
+            stems: dict[str, list[Path]] = {}
+            if os.path.isdir(path.parent) and (self.allow_outside or Path(os.path.realpath(path.parent)).is_relative_to(self._real[self.root])):
+                for entry in sorted(path.parent.iterdir()):
+                    stems.setdefault(name_key(entry.stem), []).append(entry)
+            self._folders[path.parent] = stems
+        usable = [other for other in self._folders[path.parent].get(name_key(stem), []) if other.suffix.lower() in suffixes]
         if not usable:
             return None
         composed = unicodedata.normalize("NFC", stem)
         return self.check_inside(min(usable, key=lambda other: (unicodedata.normalize("NFC", other.stem) != composed, suffixes.index(other.suffix.lower()))))
-
-    def _folder(self, folder: Path) -> dict[str, list[Path]]:
-        """The files of a folder by the key of their stem."""
-        if folder not in self._folders:
-            stems: dict[str, list[Path]] = {}
-            if os.path.isdir(folder) and (self.allow_outside or Path(os.path.realpath(folder)).is_relative_to(self._real[self.root])):
-                for entry in sorted(folder.iterdir()):
-                    stems.setdefault(name_key(entry.stem), []).append(entry)
-            self._folders[folder] = stems
-        return self._folders[folder]
 
     @cached_property
     def images_by_stem(self) -> dict[str, list[Path]]:

@@ -62,7 +62,8 @@ def _conversion(profile: bytes, mode: str) -> Conversion:
     space = _KINDS.get(profile[16:20])
     if len(profile) < 128 or profile[36:40] != b"acsp" or profile[12:16] not in _CLASSES:
         return Conversion(fault="damaged, or none of a picture")
-    if any(name[:3] == b"D2B" for name in _tags(profile)):
+    count = min(int.from_bytes(profile[128:132], "big"), (len(profile) - 132) // 12)
+    if any(profile.startswith(b"D2B", 132 + 12 * index) for index in range(count)):
         return Conversion(fault="of multi-process elements")  # littlecms would calculate a million of them for every colour
     if space is None or (space != mode and (space, mode) != ("RGB", "L")):  # a grey picture may hold the greys of a space of colours
         return Conversion(fault=f"for {space or 'other'} pictures, and this one is {mode}")
@@ -89,12 +90,6 @@ def _conversion(profile: bytes, mode: str) -> Conversion:
         return Conversion(fault="damaged: white is not brighter than black")
     alike = space != "CMYK" and np.abs(converted.astype(int) - expected).max() <= TOLERANCE
     return AS_IT_IS if alike else found
-
-
-def _tags(profile: bytes) -> list[bytes]:
-    """The names of what a profile holds."""
-    count = min(int.from_bytes(profile[128:132], "big"), (len(profile) - 132) // 12)
-    return [profile[132 + 12 * index : 136 + 12 * index] for index in range(count)]
 
 
 def _probe(conversion: Conversion) -> tuple[np.ndarray, np.ndarray]:

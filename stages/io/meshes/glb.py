@@ -118,19 +118,15 @@ class Glb:
             self._faces_left -= len(order) // (3 if (mode := primitive.get("mode", _TRIANGLES)) == _TRIANGLES else 1)
             if self._faces_left < 0:
                 raise Damaged("more faces than its bytes hold")
-            triangles.append(begin + _corners(order, mode))
+            # (F, 3) of the vertices in their order; none of points and lines
+            if mode == _TRIANGLES:
+                found = order[: len(order) // 3 * 3].reshape(-1, 3)
+            elif mode in (_STRIP, _FAN) and len(order) >= 3:
+                found = np.stack([order[:-2] if mode == _STRIP else np.full(len(order) - 2, order[0]), order[1:-1], order[2:]], axis=1)
+            else:
+                found = order[:0].reshape(0, 3)
+            triangles.append(begin + found.astype(np.int64))
         return Geometry(np.concatenate([np.empty((0, 3)), *vertices]), np.concatenate(triangles))
-
-
-def _corners(order: np.ndarray, mode: int) -> np.ndarray:
-    """(F, 3) of the vertices of a primitive in their order; none of points and lines."""
-    if mode == _TRIANGLES:
-        found = order[: len(order) // 3 * 3].reshape(-1, 3)
-    elif mode in (_STRIP, _FAN) and len(order) >= 3:
-        found = np.stack([order[:-2] if mode == _STRIP else np.full(len(order) - 2, order[0]), order[1:-1], order[2:]], axis=1)
-    else:
-        found = order[:0].reshape(0, 3)
-    return found.astype(np.int64)
 
 
 def _matrix(node: Any) -> np.ndarray:

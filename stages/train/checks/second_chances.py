@@ -105,7 +105,8 @@ def _train(
     job: Job, s: Scene, settings: TrainSettings, pixels: Pixels, held: Sequence[HeldOutView], depth: SparseDepthRays | None, name: str
 ) -> EarlyResult | None:
     """The result of a short training on a scene; None where no pixel can be compared, or masks leave none to train on."""
-    views, small = views_of(s, "train"), _small(settings)
+    kept = ("seed", "near_plane", "far_plane", "min_views", "exposure", "background_color")
+    views, small = views_of(s, "train"), replace(SMALL, **{name: getattr(settings, name) for name in kept})
     own = _with_views(pixels, views)
     near, far = depth_range(s, own, small)
     m = model(space_of(s), small, s.background, job.device, (near, far))
@@ -116,12 +117,6 @@ def _train(
     for done in loop.train(loop.trainer(m, exposure, cameras=cameras), own, depth):
         job.reached(done.step, small.iterations, f"second chance, {name}")
     return judge(held, FieldRenderer(m, near, far).colour, small.iterations)
-
-
-def _small(settings: TrainSettings) -> TrainSettings:
-    """The settings of a trial: the given ones for what is learned, not for how much."""
-    kept = ("seed", "near_plane", "far_plane", "min_views", "exposure", "background_color")
-    return replace(SMALL, **{name: getattr(settings, name) for name in kept})
 
 
 def _with_views(pixels: Pixels, views: Sequence[View]) -> Pixels:

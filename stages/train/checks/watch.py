@@ -107,16 +107,13 @@ class Watch:
         if best is None:
             self.job.warn(f"none of {len(trials) - 1} second chances is clearly better than the given settings; training continues. {REMEDY}")
         else:
-            self._clear()
+            # Remove what the training that failed left to go on from.
+            for pattern in ("checkpoint_*.safetensors", "preview_*.png", budget.FILE):
+                for path in self.job.work.glob(pattern):
+                    remove(path)
             self.job.warn(f"training restarts with {best.name}: {best.result.psnr:.2f} dB in its short training, {trials[0].result.psnr:.2f} dB without")
         note(self.job.work / DECIDED, asdict(self.decision))
         return best is not None
-
-    def _clear(self) -> None:
-        """Remove what the training that failed left to go on from."""
-        for pattern in ("checkpoint_*.safetensors", "preview_*.png", budget.FILE):
-            for path in self.job.work.glob(pattern):
-                remove(path)
 
     def write_choices(self, path: Path) -> None:
         """Write what later stages need to know, where anything was chosen, and what was found into the manifest."""

@@ -106,24 +106,17 @@ def write_cameras(outputs: TrainOutputs, t: Trainer, views: tuple[View, ...], fo
     if t.checks is None or not t.checks.changed:
         return
     refined_cameras.write(views, t.checks.cameras, outputs.cameras, _replaced_and_left_out(t.checks, views)[1])
-    _draw(outputs.wrong_views, t.checks, t.model.background, views, folder, renderer)
-
-
-def _draw(
-    path: Path, c: ViewChecks, background: tuple[float, float, float] | None, views: tuple[View, ...], folder: Path, renderer: FieldRenderer
-) -> None:
-    """Rows of photograph and render by the camera as it was given, and by the pose that was found where there is one; no file where no view is concerned."""
-    if not (c.left_out | c.replaced).any():
+    if not (t.checks.left_out | t.checks.replaced).any():
         return
     rows = []
-    for n in np.flatnonzero(c.left_out | c.replaced)[:ROWS]:
+    for n in np.flatnonzero(t.checks.left_out | t.checks.replaced)[:ROWS]:
         stride = stride_to(views[n].camera, SIDE)
-        cameras = [c.given[n], *([replace(c.given[n], world_from_camera=c.pose[n])] if c.replaced[n] else [])]
+        cameras = [t.checks.given[n], *([replace(t.checks.given[n], world_from_camera=t.checks.pose[n])] if t.checks.replaced[n] else [])]
         renders = [np.clip(renderer.colour(subsample_camera(camera, stride)), 0, 1) for camera in cameras]
-        rows.append(np.concatenate([ground_truth(folder, views[n], background, stride).colour, *renders], axis=1))
+        rows.append(np.concatenate([ground_truth(folder, views[n], t.model.background, stride).colour, *renders], axis=1))
     height, width = sum(len(row) for row in rows), max(row.shape[1] for row in rows)
     sheet, top = np.ones((height, width, 3)), 0
     for row in rows:
         sheet[top : top + len(row), : row.shape[1]] = row
         top += len(row)
-    write_png(to_uint8(sheet), path)
+    write_png(to_uint8(sheet), outputs.wrong_views)

@@ -258,32 +258,28 @@ def _glb(file: BinaryIO, size: int) -> _Found | None:
     file.seek(0)
     glb = Glb(file, size, MAX_GLTF_JSON)
     try:
-        return _glb_primitives(glb)
+        primitives = [each for mesh in glb.document["meshes"] for each in mesh["primitives"] if gltf.EXTENSION in each.get("extensions", {})]
+        if not primitives:
+            return None
+        found = _Found(f"GLB ({gltf.EXTENSION})", 0, 0)
+        for primitive in primitives:
+            below = primitive["extensions"][gltf.EXTENSION].get("extensions", {})
+            if below:
+                raise Damaged(f"Gaussians compressed by {printable(', '.join(below), 80)}; expected attributes as they are (write it without compression)")
+            names, counts = primitive["attributes"], set()
+            scales, opacities = (f"{gltf.EXTENSION}:{name}" for name in ("SCALE", "OPACITY"))
+            columns = (("POSITION", "VEC3", found.places), (scales, "VEC3", found.scales), (opacities, "SCALAR", found.opacities))
+            for name, widths, into in columns:
+                counts.add(glb.document["accessors"][names[name]]["count"])
+                for rows in glb.rows(names[name], widths):
+                    into.add(rows / np.iinfo(rows.dtype).max if rows.dtype.kind in "iu" else rows)
+            if len(counts) > 1:
+                raise Damaged(f"attributes of {sorted(counts)} rows; expected as many of each")
+            degrees = [int(each[1]) for name in names if (each := re.fullmatch(rf"{gltf.EXTENSION}:SH_DEGREE_(\d)_COEF_\d", name))]
+            found.count, found.degree = found.count + counts.pop(), max([found.degree, *degrees])
+        return found
     except (KeyError, IndexError, TypeError, AttributeError) as error:
         raise Damaged(f"a glTF document that is not as it has to be ({type(error).__name__}: {printable(error, 80)})") from error
-
-
-def _glb_primitives(glb: Glb) -> _Found | None:
-    primitives = [each for mesh in glb.document["meshes"] for each in mesh["primitives"] if gltf.EXTENSION in each.get("extensions", {})]
-    if not primitives:
-        return None
-    found = _Found(f"GLB ({gltf.EXTENSION})", 0, 0)
-    for primitive in primitives:
-        below = primitive["extensions"][gltf.EXTENSION].get("extensions", {})
-        if below:
-            raise Damaged(f"Gaussians compressed by {printable(', '.join(below), 80)}; expected attributes as they are (write it without compression)")
-        names, counts = primitive["attributes"], set()
-        scales, opacities = (f"{gltf.EXTENSION}:{name}" for name in ("SCALE", "OPACITY"))
-        columns = (("POSITION", "VEC3", found.places), (scales, "VEC3", found.scales), (opacities, "SCALAR", found.opacities))
-        for name, widths, into in columns:
-            counts.add(glb.document["accessors"][names[name]]["count"])
-            for rows in glb.rows(names[name], widths):
-                into.add(rows / np.iinfo(rows.dtype).max if rows.dtype.kind in "iu" else rows)
-        if len(counts) > 1:
-            raise Damaged(f"attributes of {sorted(counts)} rows; expected as many of each")
-        degrees = [int(each[1]) for name in names if (each := re.fullmatch(rf"{gltf.EXTENSION}:SH_DEGREE_(\d)_COEF_\d", name))]
-        found.count, found.degree = found.count + counts.pop(), max([found.degree, *degrees])
-    return found
 
 
 # what files have in common

@@ -43,21 +43,15 @@ def moved(gaussians: Gaussians, target_from_source: Similarity) -> Gaussians:
     """The same Gaussians in another frame: each looks the same to an eye that moves along. Raises ValueError where they are not finite there."""
     rotation, scale = target_from_source.rotation, target_from_source.scale
     with np.errstate(over="ignore", under="ignore"):
+        w, x, y, z = quaternions_from(rotation[None])[0]
+        product = gaussians.rotations.astype(np.float64) @ np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]).T
         return replace(
             gaussians,
             means=target_from_source.points(gaussians.means).astype(np.float32),
             scales=(scale * gaussians.scales.astype(np.float64)).astype(np.float32),
-            rotations=_products(quaternions_from(rotation[None])[0], gaussians.rotations).astype(np.float32),
+            rotations=(product / np.linalg.norm(product, axis=1, keepdims=True)).astype(np.float32),
             harmonics=turned_harmonics(gaussians.harmonics, rotation),
         )
-
-
-def _products(then: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """(N, 4) unit quaternions: the rotations `first` (N, 4), followed by `then` (4,)."""
-    w, x, y, z = then
-    matrix = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    product = first.astype(np.float64) @ matrix.T
-    return np.asarray(product / np.linalg.norm(product, axis=1, keepdims=True))
 
 
 def turned_harmonics(harmonics: np.ndarray, rotation: np.ndarray) -> np.ndarray:

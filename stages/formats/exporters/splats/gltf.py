@@ -27,32 +27,27 @@ def write_splats(gaussians: Gaussians, path: Path, frame: SourceFrame = CAPTURE_
     check_gaussians(gaussians, path)
     turned = with_y_up(gaussians, frame)
     buffer = Buffer()
+    def put(values: np.ndarray, **more: Any) -> int:
+        return buffer.accessor(np.asarray(values, "<f4"), VERTICES, **more)
+
+    means = np.asarray(turned.means, "<f4")
+    plain = linear_from_srgb(np.clip(0.5 + C0 * turned.harmonics[:, 0].astype(np.float64), 0, 1))
+    colour = np.concatenate([plain, turned.opacities[:, None]], axis=1)
+    found = {
+        "POSITION": put(means, min=means.min(0).tolist(), max=means.max(0).tolist()),
+        "COLOR_0": buffer.accessor(np.asarray(np.round(colour * 65535), "<u2"), VERTICES, normalized=True),
+        f"{EXTENSION}:ROTATION": put(turned.rotations[:, [1, 2, 3, 0]]),
+        f"{EXTENSION}:SCALE": put(turned.scales),
+        f"{EXTENSION}:OPACITY": put(turned.opacities),
+    }
+    for number in range(turned.harmonics.shape[1]):
+        degree = int(number**0.5)
+        found[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{number - degree**2}"] = put(turned.harmonics[:, number])
     primitive = {
-        "attributes": _attributes(turned, buffer),
+        "attributes": found,
         "mode": POINTS,
         "extensions": {
             EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective", "sortingMethod": "cameraDistance"}
         },
     }
     write_document("splats", primitive, EXTENSION, frame, buffer, path)
-
-
-def _attributes(gaussians: Gaussians, buffer: Buffer) -> dict[str, Any]:
-    """The attributes of the primitive, put into the buffer."""
-    def put(values: np.ndarray, **more: Any) -> int:
-        return buffer.accessor(np.asarray(values, "<f4"), VERTICES, **more)
-
-    means = np.asarray(gaussians.means, "<f4")
-    plain = linear_from_srgb(np.clip(0.5 + C0 * gaussians.harmonics[:, 0].astype(np.float64), 0, 1))
-    colour = np.concatenate([plain, gaussians.opacities[:, None]], axis=1)
-    found = {
-        "POSITION": put(means, min=means.min(0).tolist(), max=means.max(0).tolist()),
-        "COLOR_0": buffer.accessor(np.asarray(np.round(colour * 65535), "<u2"), VERTICES, normalized=True),
-        f"{EXTENSION}:ROTATION": put(gaussians.rotations[:, [1, 2, 3, 0]]),
-        f"{EXTENSION}:SCALE": put(gaussians.scales),
-        f"{EXTENSION}:OPACITY": put(gaussians.opacities),
-    }
-    for number in range(gaussians.harmonics.shape[1]):
-        degree = int(number**0.5)
-        found[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{number - degree**2}"] = put(gaussians.harmonics[:, number])
-    return found
