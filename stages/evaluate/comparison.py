@@ -98,7 +98,10 @@ def evaluate_view(e: Evaluation, view: View, field: FieldRenderer | None, stride
         seen = field.render(small_camera, progress=lambda *_: e.job.safe_point(), box=asset.box, reach=asset.reach, limits=asset.limits)
     output = e.rendering(view)
     image = e.shown(view, output.colour, "the asset")
-    metrics |= {"trivial": trivial(truth), "sparse_points": None if e.points is None else against_points(e.points, e.scene, view, output.depth, truth)}
+    metrics |= {"trivial": trivial(truth), "sparse_points": None}
+    if e.points is not None:
+        _, kinds, subject = judged(e.points, e.scene.views.index(view), view.camera, output.depth, counting(truth))
+        metrics["sparse_points"] = counts_of(kinds, subject)
     size = {"width": view.camera.width, "height": view.camera.height}
     inside = truth.inside if seen is None or asset.inner is None else upsample(seen.inside_opacity, stride, **size) >= 0.5
     metrics["asset"] = {**compare(image, truth, inside), **size, **lpips_metrics(e.perceptual, image, truth)}
@@ -111,7 +114,10 @@ def evaluate_view(e: Evaluation, view: View, field: FieldRenderer | None, stride
         small = truth.subsampled(stride)
         render = e.shown(view, seen.colour, "the field", stride)
         inside = small.inside if asset.inner is None else seen.inside_opacity >= 0.5
-        network = {**compare(render, small, inside), "width": render.shape[1], "height": render.shape[0], **sample_shares(seen.counts)}
+        network = {**compare(render, small, inside), "width": render.shape[1], "height": render.shape[0]}
+        # Valid and pivotal samples over rays x N_c (EfficientNeRF, equations 5 and 12), counted between near and far; fine samples a ray.
+        counts = seen.counts
+        network |= {"valid_share": counts.valid_share, "pivotal_share": counts.pivotal_share, "fine_per_ray": counts.fine / max(counts.rays, 1)}
         metrics["network"] = network | lpips_metrics(e.perceptual, render, small)
         same_image, same_opacity = subsample(image, stride), subsample(output.opacity, stride)
         metrics |= differences(asset, small_camera, same_image, same_opacity, replace(seen, colour=render), small, metrics["network"])
@@ -156,12 +162,6 @@ def counting(truth: GroundTruth) -> np.ndarray:
     return truth.used if truth.inside is None else truth.used & truth.inside
 
 
-def against_points(points: ReliablePoints, scene: Scene, view: View, depth: np.ndarray, truth: GroundTruth) -> dict[str, int]:
-    """COUNTS of the view's sparse points."""
-    _, kinds, subject = judged(points, scene.views.index(view), view.camera, depth, counting(truth))
-    return counts_of(kinds, subject)
-
-
 def squared_error(image: np.ndarray, truth: GroundTruth) -> np.ndarray:
     """(H, W) mean over the channels; of pixels without a finite value 0."""
     return np.nan_to_num(np.square(np.clip(np.asarray(image, np.float64), 0, 1) - truth.colour).mean(axis=-1))
@@ -200,11 +200,6 @@ def lpips_metrics(perceptual: Mapping[str, Lpips], image: np.ndarray, truth: Gro
     """LPIPS by name; None for images too small for the networks."""
     large = min(image.shape[:2]) >= SMALLEST
     return {name: metric(image, truth.colour, truth.mask) if large else None for name, metric in perceptual.items()}
-
-
-def sample_shares(counts: Any) -> dict[str, float]:
-    """Valid and pivotal samples over rays x N_c (EfficientNeRF, equations 5 and 12), counted between near and far; fine samples a ray."""
-    return {"valid_share": counts.valid_share, "pivotal_share": counts.pivotal_share, "fine_per_ray": counts.fine / max(counts.rays, 1)}
 
 
 def compare(image: np.ndarray, truth: GroundTruth, inside: np.ndarray | None) -> dict[str, float | None]:

@@ -15,14 +15,10 @@ def find_weights(network: str, folder: str | None) -> tuple[Path, Path]:
     places = [Path(folder)] if folder else []
     hub = Path(os.environ.get("TORCH_HOME", Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "torch")).expanduser() / "hub" / "checkpoints"
     backbone = _found(BACKBONES[network], [*places, hub], f"Download {SITE}{BACKBONES[network]} into one of them, or name its folder: evaluate.lpips_weights.")
-    heads = _found(f"{network}.pth", [*places, *_in_torchmetrics()], "Install the extra that brings it: pip install 'efficientnerf[lpips]'.")
+    spec = find_spec("torchmetrics")  # which is not imported
+    brought = [Path(place) / "functional/image/lpips_models" for place in (spec.submodule_search_locations or [])] if spec is not None else []
+    heads = _found(f"{network}.pth", [*places, *brought], "Install the extra that brings it: pip install 'efficientnerf[lpips]'.")
     return backbone, heads
-
-
-def _in_torchmetrics() -> list[Path]:
-    """The folder of the heads in torchmetrics, which is not imported."""
-    spec = find_spec("torchmetrics")
-    return [Path(place) / "functional" / "image" / "lpips_models" for place in (spec.submodule_search_locations or [])] if spec is not None else []
 
 
 def _found(name: str, places: list[Path], remedy: str) -> Path:

@@ -48,6 +48,8 @@ def summary(
     asset: dict[str, Any] = {**means(assets), **means(assets, perceptual), "views": len(assets), "scale": 1.0}
     asset["on_network_views"] = means([view["asset"] for view in drawn])
     plain = [view["trivial"] for view in figures if view["trivial"] is not None]
+    columns = zip(BLURS, *(view["blurred"] for view in plain), strict=True)
+    blurred = [math.fsum(column) / len(plain) for _, *column in columns] if plain else []
     composited = [view["asset_with_network_background"] for view in drawn if view["asset_with_network_background"] is not None]
     return {
         "format": FORMAT,
@@ -60,18 +62,12 @@ def summary(
         "gap": {**means([view["gap"] for view in drawn], GAP), "views": len(drawn), "scale": 1.0 / stride},
         **means(drawn, AGAINST_NETWORK),
         "train": train,
-        "trivial": {"mean_colour": means(plain, ("mean_colour",))["mean_colour"], "blurs": list(BLURS), "blurred": _columns(plain)},
+        "trivial": {"mean_colour": means(plain, ("mean_colour",))["mean_colour"], "blurs": list(BLURS), "blurred": blurred},
         "sparse_points": agreement([view["sparse_points"] for view in figures]),
         "refinement": refinement,
         "strips": list(strips),
         "views": list(figures),
     }
-
-
-def _columns(plain: Sequence[Mapping[str, Any]]) -> list[float]:
-    """The mean of each of `blurred`."""
-    columns = zip(BLURS, *(view["blurred"] for view in plain), strict=True)
-    return [math.fsum(column) / len(plain) for _, *column in columns] if plain else []
 
 
 def means(figures: Sequence[Mapping[str, Any]], names: Sequence[str] = QUALITY) -> dict[str, float | None]:

@@ -43,20 +43,17 @@ def write_contact_sheet(scene: Scene, folder: Path, rejected: Sequence[tuple[str
 
 
 def _framed(path: Path | None, split: str) -> np.ndarray:
-    framed = ImageOps.expand(_thumbnail(path), FRAME, COLOURS[split])
-    if split == "rejected":
-        draw, right, bottom = ImageDraw.Draw(framed), framed.width - 1, framed.height - 1
-        draw.line((0, 0, right, bottom), fill=COLOURS[split], width=FRAME)
-        draw.line((0, bottom, right, 0), fill=COLOURS[split], width=FRAME)
-    return np.asarray(framed)
-
-
-def _thumbnail(path: Path | None) -> Any:
-    """Longest side at most THUMBNAIL; grey without an image."""
+    """Longest side at most THUMBNAIL within the frame; grey without an image."""
+    picture: Any = Image.new("RGB", (THUMBNAIL, THUMBNAIL * 3 // 4), (200, 200, 200))
     if path is not None:
         with contextlib.suppress(UnreadableImage), opened(path) as image:
             image.draft("RGB", (2 * THUMBNAIL, 2 * THUMBNAIL))
             upright = ImageOps.exif_transpose(image)
             upright.thumbnail((THUMBNAIL, THUMBNAIL))
-            return upright.convert("RGBA" if upright.mode in ("RGBA", "LA", "P", "PA") else "RGB")
-    return Image.new("RGB", (THUMBNAIL, THUMBNAIL * 3 // 4), (200, 200, 200))
+            picture = upright.convert("RGBA" if upright.mode in ("RGBA", "LA", "P", "PA") else "RGB")
+    framed = ImageOps.expand(picture, FRAME, COLOURS[split])
+    if split == "rejected":
+        draw, right, bottom = ImageDraw.Draw(framed), framed.width - 1, framed.height - 1
+        draw.line((0, 0, right, bottom), fill=COLOURS[split], width=FRAME)
+        draw.line((0, bottom, right, 0), fill=COLOURS[split], width=FRAME)
+    return np.asarray(framed)

@@ -38,15 +38,8 @@ class RenderOptions:
 
 
 def render_frames(
-    tree: NerfTree,
-    cameras: Sequence[Camera],
-    folder: Path,
-    options: RenderOptions,
-    progress: Callable[[int, int], None],
-    *,
-    reuse: bool = False,
-    draw: Callable[..., Rendering] | None = None,
-    warn: Warn = lambda text: None,
+    tree: NerfTree, cameras: Sequence[Camera], folder: Path, options: RenderOptions, progress: Callable[[int, int], None], *, reuse: bool = False,
+    draw: Callable[..., Rendering] | None = None, warn: Warn = lambda text: None,
 ) -> list[Path]:
     """Write frame_0000.png and so on (and .exr) to a folder; returns the files in order.
 
@@ -84,13 +77,8 @@ def render_frames(
 
 
 def _write_frame(
-    output: Rendering,
-    camera: Camera,
-    of_capture: SourceFrame,
-    background: tuple[float, float, float] | None,
-    outputs: Sequence[Path],
-    record: Path | None,
-    level: int,
+    output: Rendering, camera: Camera, of_capture: SourceFrame, background: tuple[float, float, float] | None, outputs: Sequence[Path],
+    record: Path | None, level: int,
 ) -> None:
     """outputs  a PNG, and an EXR where one is wanted; `record` is their note, None where they are not kept for later."""
     for exr in outputs[1:]:

@@ -149,11 +149,7 @@ def shows(xyz: np.ndarray, camera: Camera, mask: np.ndarray | None = None, margi
 
 
 def bounds_of_frusta(
-    cameras: Sequence[Camera],
-    ranges: Ranges,
-    focus: np.ndarray,
-    converging: bool,
-    least: float = 0.9,
+    cameras: Sequence[Camera], ranges: Ranges, focus: np.ndarray, converging: bool, least: float = 0.9
 ) -> tuple[np.ndarray, np.ndarray]:
     """A box round the volume that most cameras have in view.
 

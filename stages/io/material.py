@@ -48,28 +48,18 @@ def find_material(sources: Mapping[str, Path], allow_outside: bool, warn: Warn) 
     """What folders and videos hold, each by its source's name and its own; nothing is decoded. Raises BadInput."""
     found = Material()
     for called, path in sources.items():
-        one = _material_of(path, allow_outside, warn)
-        before = f"{called}/" if called else ""
-        found.paths |= {f"{before}{name}": file for name, file in one.paths.items()}
-        found.masks |= {f"{before}{name}": file for name, file in one.masks.items()}
-        found.videos |= {called if path == file else f"{before}{name}": file for name, file in one.videos.items()} if called else one.videos
-    return found
-
-
-def _material_of(path: Path, allow_outside: bool, warn: Warn) -> Material:
-    found = Material()
-    if not path.is_dir():
-        found.videos[path.name] = path
-        return found
-    source = Source(path, allow_outside)
-    with one_line_errors(source.root):
-        files = photographs(source)
-        into = found.videos if is_video(files[0]) else found.paths
-        into |= {source.name_of(file): source.real(file) for file in files}
-        if into is found.paths:
-            found.masks |= {source.name_of(image): source.real(mask) for image, mask in masks_of(source, files).items()}
-    for sentence in source.warnings():
-        warn(sentence)
+        if not path.is_dir():
+            found.videos[called or path.name] = path
+            continue
+        source, before = Source(path, allow_outside), f"{called}/" if called else ""
+        with one_line_errors(source.root):
+            files = photographs(source)
+            into = found.videos if is_video(files[0]) else found.paths
+            into |= {f"{before}{source.name_of(file)}": source.real(file) for file in files}
+            if into is found.paths:
+                found.masks |= {f"{before}{source.name_of(image)}": source.real(mask) for image, mask in masks_of(source, files).items()}
+        for sentence in source.warnings():
+            warn(sentence)
     return found
 
 

@@ -1,5 +1,6 @@
 """What a stage reads of photographs, each decoded once for a size: the photographs at working sizes, their alpha channels and masks at a small one."""
 
+import contextlib
 import hashlib
 import os
 from dataclasses import dataclass, field, fields, replace
@@ -64,7 +65,11 @@ class PhotoReader:
 
     def alpha(self, photo: Photo) -> np.ndarray | None:
         if photo.image not in self._alpha:
-            self._alpha[photo.image] = _alpha_of(photo)
+            found = None
+            with contextlib.suppress(UnreadableImage):
+                if read_header(photo.image).alpha and (pixels := decode(photo.image, as_stored=True).pixels).shape[2] == 4:
+                    found = reduced(pixels[..., 3])
+            self._alpha[photo.image] = found
         return self._alpha[photo.image]
 
     def mask(self, photo: Photo) -> np.ndarray | None:
@@ -73,7 +78,11 @@ class PhotoReader:
             return None
         key = photo.image, _key(photo.mask, SMALL), photo.mask_ignore
         if key not in self._masks:
-            self._masks[key] = _mask_of(photo)
+            found = None
+            with contextlib.suppress(UnreadableImage):
+                levels, size = mask_levels(photo, read_header(photo.image).orientation)[0], (photo.camera.width, photo.camera.height)
+                found = reduced(levels if levels.shape[::-1] == size else np.asarray(cv2.resize(levels, size, interpolation=cv2.INTER_NEAREST)))
+            self._masks[key] = found
         return self._masks[key]
 
     def silhouette(self, photo: Photo, silhouettes: Silhouettes) -> np.ndarray | None:
@@ -103,27 +112,6 @@ def _key(path: Path, max_side: int) -> str:
     except OSError:  # reading it says why
         state = 0, 0, 0
     return hashlib.sha256(repr((os.fspath(path), *state, max_side)).encode()).hexdigest()[:32]
-
-
-def _alpha_of(photo: Photo) -> np.ndarray | None:
-    try:
-        if not read_header(photo.image).alpha:
-            return None
-        pixels = decode(photo.image, as_stored=True).pixels
-    except UnreadableImage:
-        return None
-    return reduced(pixels[..., 3]) if pixels.shape[2] == 4 else None
-
-
-def _mask_of(photo: Photo) -> np.ndarray | None:
-    try:
-        levels = mask_levels(photo, read_header(photo.image).orientation)[0]
-    except UnreadableImage:
-        return None
-    size = photo.camera.width, photo.camera.height
-    if levels.shape[::-1] != size:
-        levels = np.asarray(cv2.resize(levels, size, interpolation=cv2.INTER_NEAREST))
-    return reduced(levels)
 
 
 def reduced(levels: np.ndarray) -> np.ndarray:

@@ -98,6 +98,10 @@ def save(scene: Scene, folder: Path) -> None:
         | {"camera": camera_to_json(view.camera), "source_camera": camera_to_json(view.source_camera)}
         for view in scene.views
     ]
+    forward = None
+    if (found := scene.forward) is not None:
+        facts = {"bounds": found.bounds.tolist(), "far": found.far, "radii": list(found.radii), "focus": found.focus}
+        forward = {**found.ndc.to_json(), **facts, "tangents": list(found.tangents)}
     document = {
         "format": FORMAT,
         "kind": scene.kind,
@@ -109,7 +113,7 @@ def save(scene: Scene, folder: Path) -> None:
         "points": scene.points,
         "metric": scene.metric,
         "space": scene.space,
-        "forward": None if scene.forward is None else _forward_to_json(scene.forward),
+        "forward": forward,
         "views": views,
     }
     write_json(PosesOutputs(folder).scene, document)
@@ -258,11 +262,6 @@ def describe(folder: Path) -> dict[str, Any]:
         "warnings": [printable(sentence, 1000) for sentence in poses_report(folder).warnings or ()],
         "cameras": cameras,
     }
-
-
-def _forward_to_json(forward: ForwardFacing) -> dict[str, Any]:
-    facts = {"bounds": forward.bounds.tolist(), "far": forward.far, "radii": list(forward.radii), "focus": forward.focus}
-    return {**forward.ndc.to_json(), **facts, "tangents": list(forward.tangents)}
 
 
 def _forward_from(document: SceneDocument) -> ForwardFacing | None:

@@ -4,7 +4,6 @@ import re
 import shutil
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import cv2
 import numpy as np
@@ -51,7 +50,9 @@ def decode(path: Path, as_stored: bool = False) -> Decoded:
     """Every pixel of an image file; raises UnreadableImage, also where the file ends early."""
     with opened(path) as image:
         orientation, profile = orientation_of(image), profile_of(image)
-        verbatim = orientation == 1 and "transparency" not in image.info and _is_plain(image) and profile.transform is None
+        # Later stages read the file itself of JPEG in colour, and of PNG with 8 bits a channel.
+        plain = image.mode == "RGB" if image.format == "JPEG" else image.format == "PNG" and image.mode in ("RGB", "RGBA") and holds_eight_bits(image)
+        verbatim = orientation == 1 and "transparency" not in image.info and plain and profile.transform is None
         rgb, alpha = rgb_and_alpha(image, as_stored)
     pixels = rgb if alpha is None else np.dstack([rgb, alpha])
     return Decoded(np.ascontiguousarray(apply_exif_orientation(pixels, orientation)), verbatim, orientation, profile.fault)
@@ -84,8 +85,9 @@ def write(photo: Photo, folder: Path, relative: str, *, max_side: int, silhouett
         warnings += remarks
         whole = _cut_out(whole, levels, size)
     elif photo.mask is not None:
-        kept, remarks = _usable(photo, size, found.orientation)
+        levels, lossy, remarks = _read_mask(photo, found.orientation)
         warnings += remarks
+        kept = marked_at(levels, lossy, size) == (photo.mask_ignore == "black")
         usable = kept if usable is None else usable & kept
     if silhouettes and not may_be_empty and whole.shape[2] == 4 and (whole[..., 3] <= TRANSPARENT).all():
         raise UnreadableImage("has an empty silhouette")
@@ -132,11 +134,6 @@ def _short(part: str) -> str:
     return part.encode()[: MAX_PART - 8].decode(errors="ignore") + suffix
 
 
-def _is_plain(image: Any) -> bool:
-    """Whether later stages read the file itself: JPEG in colour, PNG with 8 bits a channel."""
-    return image.mode == "RGB" if image.format == "JPEG" else image.format == "PNG" and image.mode in ("RGB", "RGBA") and holds_eight_bits(image)
-
-
 def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Resized by area averaging in sRGB, colours weighted by alpha."""
     if pixels.shape[1::-1] == size or pixels.shape[2] == 3:
@@ -177,13 +174,6 @@ def mask_levels(photo: Photo, orientation: int) -> tuple[np.ndarray, list[str]]:
         noise = LOSSY_NOISE if lossy else TRANSPARENT
         levels = np.where(levels <= noise, np.uint8(0), np.where(levels >= 255 - noise, np.uint8(255), levels))
     return levels if photo.mask_ignore == "black" else 255 - levels, warnings
-
-
-def _usable(photo: Photo, size: tuple[int, int], orientation: int) -> tuple[np.ndarray, list[str]]:
-    """(h, w) bool at working size from the photo's mask file, and warnings."""
-    levels, lossy, warnings = _read_mask(photo, orientation)
-    marked = marked_at(levels, lossy, size)
-    return marked if photo.mask_ignore == "black" else ~marked, warnings
 
 
 def _read_mask(photo: Photo, orientation: int) -> tuple[np.ndarray, bool, list[str]]:

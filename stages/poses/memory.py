@@ -4,7 +4,6 @@ import contextlib
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from efficientnerf.settings import resolved
 from pipeline.errors import PipelineError
@@ -87,7 +86,10 @@ def feature_threads(job: Job, sizes: Sequence[tuple[int, int]], max_side: int, f
 def memory_needed(known: Known) -> Need:
     """As if no cameras were known: of a set with cameras less is taken."""
     own, (pictures, sizes) = known.settings["poses"], _pictures(known.sources)
-    films = [] if pictures else _films(known.sources)
+    films = []
+    for path in [] if pictures else [path for source in known.sources for path in files_below(source)]:
+        with contextlib.suppress(UnreadableVideo), opened(path) as video:
+            films.append(video.stored)
     count = len(pictures) or own.frames
     largest = max([*sizes, *films], key=lambda size: size[0] * size[1], default=(0, 0))
     features = resolved(own.max_features) or features_for(count)
@@ -103,7 +105,9 @@ def space_needed(known: Known) -> int:
     """Working images, and what structure from motion reads: copies of photographs, or the frames of videos. Videos count where there are no images."""
     own, (pictures, sizes) = known.settings["poses"], _pictures(known.sources)
     count = (len(pictures) or own.frames) * (VIEWS if own.lens == "equirectangular" else 1)
-    found = _cameras_are_found(own, known.sources)
+    found = True  # whether structure from motion has to find cameras, as far as is known before
+    with contextlib.suppress(PipelineError, OSError):  # the stage says so
+        found = len(known.sources) != 1 or formats_of(known.sources[0], own)[0] == "photographs"
     sides = (own.max_image_size, own.feature_image_size) if found else (own.max_image_size,)
     pixels = [sum(width * height for width, height in (working_size(*size, side) for side in sides)) for size in sizes]
     mean = sum(pixels) / len(pixels) if pixels else ASPECT * sum(side**2 for side in sides)
@@ -121,19 +125,3 @@ def _pictures(sources: Sequence[Path]) -> tuple[list[Path], list[tuple[int, int]
         with contextlib.suppress(UnreadableImage, OSError):  # the stage says so
             sizes.append(read_header(path).size)
     return pictures, sizes
-
-
-def _films(sources: Sequence[Path]) -> list[tuple[int, int]]:
-    """The sizes of all videos below the sources."""
-    sizes = []
-    for path in (path for source in sources for path in files_below(source)):
-        with contextlib.suppress(UnreadableVideo), opened(path) as video:
-            sizes.append(video.stored)
-    return sizes
-
-
-def _cameras_are_found(own: Any, sources: Sequence[Path]) -> bool:
-    """Whether structure from motion has to find them, as far as is known before."""
-    with contextlib.suppress(PipelineError, OSError):  # the stage says so
-        return len(sources) != 1 or formats_of(sources[0], own)[0] == "photographs"
-    return True

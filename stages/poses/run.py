@@ -66,7 +66,8 @@ def run(job: Job) -> None:
     capture, use = with_mask_use(job, capture, reader, warn)
     capture, written = _write_images(job, capture, warn)
     judged = capture  # by all sparse points that its cameras were found with
-    capture = with_points_of_object(capture, reader)
+    if capture.silhouettes and capture.points is not None:  # sparse points that lie outside of silhouettes are left out
+        capture = replace(capture, points=capture.points.only(np.flatnonzero(points_of_object(capture, reader))))
     framed = training_frame.find_training_frame(
         capture, up=settings.up, box=resolved(settings.crop_box), margin=settings.box_margin, space=settings.space, reader=reader
     )
@@ -160,13 +161,6 @@ def with_mask_use(job: Job, capture: Capture, reader: PhotoReader, warn: Any) ->
     if not use.silhouettes:
         return replace(capture, background=None), use
     return replace(capture, background=WHITE, silhouettes=use.silhouettes), use
-
-
-def with_points_of_object(capture: Capture, reader: PhotoReader) -> Capture:
-    """Without the sparse points that lie outside of silhouettes."""
-    if not capture.silhouettes or capture.points is None:
-        return capture
-    return replace(capture, points=capture.points.only(np.flatnonzero(points_of_object(capture, reader))))
 
 
 def _may_be_renders(capture: Capture) -> bool:

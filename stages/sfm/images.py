@@ -45,17 +45,8 @@ def _sha256(path: Path) -> str:
 
 
 def prepare_images(
-    paths: Mapping[str, Path],
-    *,
-    max_side: int,
-    features: int,
-    seed: int,
-    masks: Masks,
-    lens: str = "auto",
-    threads: int = 1,
-    work: Path,
-    copies: Path | None = None,
-    **callables: Unpack[Callables],
+    paths: Mapping[str, Path], *, max_side: int, features: int, seed: int, masks: Masks, lens: str = "auto", threads: int = 1, work: Path,
+    copies: Path | None = None, **callables: Unpack[Callables],
 ) -> tuple[list[WorkImage], list[tuple[str, str]]]:
     """Copies of the photographs in `work/images` after EXIF rotation, longest side at most `max_side`; without those that cannot be read.
 
@@ -68,13 +59,21 @@ def prepare_images(
     safe_point, warn, reader = callables["safe_point"], callables["warn"], PhotoReader(copies or work / "photographs")
     request: dict[str, object] = {"layout": LAYOUT, "max_side": max_side, "features": features, "seed": seed, "lens": lens}
     rows: list[list[str | None]] = []
-    for name in sorted(paths):
+    ordered = sorted(paths)
+    for name in ordered:
         safe_point()
         mask = masks.get(name)
         rows.append([name, _sha256(paths[name]), _sha256(mask) if mask is not None else NO_MASK if name in masks else None])
     request["photographs"] = rows
-    _begin(work, json.dumps(request, indent=1, sort_keys=True).encode())
-    ordered = sorted(paths)
+    # The work folder is emptied, unless it is of this very request.
+    whole, record, parts = json.dumps(request, indent=1, sort_keys=True).encode(), work / "request.json", (work / "images", work / "masks")
+    work.mkdir(parents=True, exist_ok=True)
+    if not _holds(record, whole) or any(part.is_symlink() or not part.is_dir() for part in parts):
+        for entry in list(work.iterdir()):
+            remove(entry)
+        for part in parts:
+            part.mkdir()
+        write_atomically(record, whole, durable=False)
     copied = in_order(
         lambda index: _copy(ordered[index], paths[ordered[index]], index, max_side, masks, lens, work, reader), range(len(ordered)), threads, safe_point
     )
@@ -90,18 +89,6 @@ def prepare_images(
             images.append(image)
         callables["progress"](index + 1, len(paths), "reading photographs")
     return images, rejected
-
-
-def _begin(work: Path, request: bytes) -> None:
-    """Empty the work folder, unless it is of this very request."""
-    record, parts = work / "request.json", (work / "images", work / "masks")
-    work.mkdir(parents=True, exist_ok=True)
-    if not _holds(record, request) or any(part.is_symlink() or not part.is_dir() for part in parts):
-        for entry in list(work.iterdir()):
-            remove(entry)
-        for part in parts:
-            part.mkdir()
-        write_atomically(record, request, durable=False)
 
 
 def _copy(name: str, path: Path, index: int, max_side: int, masks: Masks, lens: str, work: Path, reader: PhotoReader) -> tuple[WorkImage | None, str]:

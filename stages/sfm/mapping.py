@@ -84,14 +84,7 @@ def contradicts_exif(focal: float, prior: float | None) -> bool:
 
 
 def _incremental_mapping(
-    work: Path,
-    count: int,
-    seed: int,
-    options_of_attempt: Options,
-    progress: Progress,
-    safe_point: SafePoint,
-    *,
-    refine_camera: bool = True,
+    work: Path, count: int, seed: int, options_of_attempt: Options, progress: Progress, safe_point: SafePoint, *, refine_camera: bool = True,
     start: Any = None,
 ) -> list[Any]:
     """All sub-models, by the number of registered photographs, then of points. On one thread: with two the results vary."""

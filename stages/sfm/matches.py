@@ -22,13 +22,7 @@ MIN_PAIRS_A_WORKER = 96  # a process is not worth its start for fewer
 
 
 def extract_features(
-    work: Path,
-    images: Sequence[WorkImage],
-    *,
-    features: int,
-    threads: int | None = None,
-    contrast: float = 1.0,
-    progress: Progress,
+    work: Path, images: Sequence[WorkImage], *, features: int, threads: int | None = None, contrast: float = 1.0, progress: Progress,
     safe_point: SafePoint,
 ) -> None:
     """SIFT features of the images that have none yet, a few images at a time; those that were detected before are taken from where they are kept.
@@ -112,16 +106,8 @@ def match_photographs(work: Path, images: Sequence[WorkImage], how: str, *, seed
 
 
 def match_pairs(
-    work: Path,
-    images: Sequence[WorkImage],
-    wanted: Iterable[Pair],
-    *,
-    seed: int,
-    workers: int = 1,
-    name: str = "",
-    guided: bool = False,
-    progress: Progress,
-    safe_point: SafePoint,
+    work: Path, images: Sequence[WorkImage], wanted: Iterable[Pair], *, seed: int, workers: int = 1, name: str = "", guided: bool = False,
+    progress: Progress, safe_point: SafePoint,
 ) -> None:
     """Matches and two-view geometries of those of the wanted pairs that have none yet, a block at a time.
 

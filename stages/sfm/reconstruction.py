@@ -6,20 +6,20 @@ own; docs/experiments/sfm.md says why the steps are these.
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import os
 import shutil
 import sqlite3
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Unpack
 
 from msgspec import UNSET, UnsetType, structs
 
+from pipeline.errors import BadInput
 from pipeline.files import remove
 from stages.cores import count_cores
+from stages.formats.importers.source import abbreviated
 from stages.io.capture import Capture, Markers
 from stages.sfm import attempts, mapping, matches, result
 from stages.sfm.added.markers import keep_markers
@@ -84,16 +84,22 @@ def reconstruct(r: Request, **callables: Unpack[Callables]) -> Capture:
         **callables,
     )  # fmt: skip
     if len(images) < mapping.MIN_MODEL_SIZE:
-        raise result.too_few(r.folder, images, unreadable)
+        found = f"{r.folder}: {len(images)} readable photographs; at least {mapping.MIN_MODEL_SIZE} are needed, and 20 or more all round a subject are better."
+        names = abbreviated([name for name, _ in unreadable], result.MAX_NAMES)
+        raise BadInput(found + (f" Unreadable: {names}." if unreadable else ""))
     keep_markers(r.work, images, r.markers)
 
     # Features, matches of pairs, and COLMAP's mapper, with further attempts where photographs have no camera.
     search = Search(r.work, images, r.seed, features, threads, progress, safe_point, r.networks)
     matching = matching_for(len(images)) if r.matching == "auto" else r.matching
-    with _full_disk_named(r.work):
+    try:
         open_database(r.work, images, callables["warn"])
         matches.extract_features(r.work, images, features=features, threads=threads, progress=progress, safe_point=safe_point)
         find_models(search, matching)
+    except (RuntimeError, sqlite3.OperationalError) as error:  # COLMAP reports a full disk as one of many RuntimeErrors
+        if shutil.disk_usage(r.work).free < 1 << 20:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(r.work)) from error
+        raise
     rejected = [*unreadable, *result.unregistered(search)]
     if mapping.num_registered(search.models) < max(mapping.MIN_MODEL_SIZE, len(images) / 2):
         raise result.not_found(r.folder, r.paths, search, rejected, matching)
@@ -125,14 +131,3 @@ def find_models(search: Search, matching: str) -> Search:
         if attempt.when(search) and (models := attempt.run(search)) is not None:
             search.keep(attempt.name, models, least=attempt.least(search), better=attempt.better(search, models))
     return search
-
-
-@contextlib.contextmanager
-def _full_disk_named(work: Path) -> Iterator[None]:
-    """COLMAP reports a full disk as one of many RuntimeErrors."""
-    try:
-        yield
-    except (RuntimeError, sqlite3.OperationalError) as error:
-        if shutil.disk_usage(work).free < 1 << 20:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(work)) from error
-        raise

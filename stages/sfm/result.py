@@ -75,14 +75,6 @@ def provenance_of(search: Search, matching: str) -> Provenance:
     )
 
 
-def too_few(folder: Path, images: Sequence[WorkImage], unreadable: Rejected) -> BadInput:
-    """The error where fewer photographs can be read than a model has at least."""
-    return BadInput(
-        f"{folder}: {len(images)} readable photographs; at least {mapping.MIN_MODEL_SIZE} are needed, and 20 or more all round a subject are better."
-        + (f" Unreadable: {abbreviated([name for name, _ in unreadable], MAX_NAMES)}." if unreadable else "")
-    )
-
-
 def not_found(folder: Path, paths: Mapping[str, Path], search: Search, rejected: Rejected, matching: str) -> BadInput:
     """The error where most photographs have no camera; the verdict on them is written into the scratch folder."""
     hints = ["more photographs with at least 60 % overlap between neighbours, sharp, of a subject with texture"]

@@ -20,10 +20,7 @@ SIDE = 200  # longest side of a preview, pixels
 
 
 class Previews:
-    """Preview renders in the scratch folder.
-
-    psnr  of the last one; None before the first
-    """
+    """Preview renders in the scratch folder."""
 
     def __init__(
         self, render: Callable[[Camera], np.ndarray], background: tuple[float, float, float] | None, poses: Path, s: Scene, work: Path, every: int | None = None

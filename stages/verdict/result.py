@@ -95,9 +95,7 @@ def verdict_on_result(metrics: Mapping[str, Any], cameras: CameraVerdict | None 
     found = [
         *_of_held_out(metrics, figures, cameras, strip),
         *_of_single_views(metrics, figures, strip),
-        *_of_gap(metrics, strip),
-        *_of_holes(metrics, strip),
-        *_of_floaters(metrics, strip),
+        *_of_asset(metrics, strip),
         *_of_sparse_points(metrics),
         *_of_mesh(metrics, figures),
         *_of_splats(metrics, figures),
@@ -248,34 +246,29 @@ def _of_single_views(metrics: Mapping[str, Any], figures: Mapping[str, Any], str
     return [ResultProblem("single views", "usable" if len(bad) > POOR_VIEWS * len(views) else "good", sentence, cause, remedy, strip, bad)]
 
 
-def _of_gap(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:
-    gap = metrics["gap"]["psnr"]
-    if gap is None or gap >= GAP:
-        return []
-    sentence = f"The asset is {-gap:.2f} dB behind its network on the same pixels: it has lost detail that the network had."
-    usual = ("It has too few voxels, or too few steps fitted them.", "Give it more voxels (bake.max_mib), or more steps to fit them (bake.refine_steps).")
-    return [ResultProblem("gap", "usable" if gap < LARGE_GAP else "good", sentence, *(_short(metrics) or usual), strip)]
+def _of_asset(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:
+    """Of the asset against its network; holes and floaters only where the photographs side with the network, of holes visibly."""
+    found = []
 
+    def add(what: str, grade: str, sentence: str, cause: str, remedy: str) -> None:
+        found.append(ResultProblem(what, grade, sentence, *(_short(metrics) or (cause, remedy)), strip))
 
-def _of_holes(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:
-    """Reported only where the photographs visibly side with the network."""
-    holes, excess = metrics["holes"], metrics["holes_excess_error"]
-    if holes is None or holes <= HOLES or (excess is not None and excess < VISIBLE**2 * holes):
-        return []
-    sentence = f"The asset has holes: {100 * holes:.1f} % of the pixels show through where the network shows something solid."
-    remedy = "Keep more voxels (a lower bake.weight_threshold, more bake.visibility_rays), or allow a larger asset (bake.max_mib)."
-    usual = ("Voxels that few rays see were left out.", remedy)
-    return [ResultProblem("holes", "poor" if holes > MANY_HOLES else "usable", sentence, *(_short(metrics) or usual), strip)]
-
-
-def _of_floaters(metrics: Mapping[str, Any], strip: str) -> list[ResultProblem]:
-    """Reported only where the photographs side with the network."""
+    gap, holes, excess = metrics["gap"]["psnr"], metrics["holes"], metrics["holes_excess_error"]
+    if gap is not None and gap < GAP:
+        sentence = f"The asset is {-gap:.2f} dB behind its network on the same pixels: it has lost detail that the network had."
+        remedy = "Give it more voxels (bake.max_mib), or more steps to fit them (bake.refine_steps)."
+        add("gap", "usable" if gap < LARGE_GAP else "good", sentence, "It has too few voxels, or too few steps fitted them.", remedy)
+    if holes is not None and holes > HOLES and (excess is None or excess >= VISIBLE**2 * holes):
+        sentence = f"The asset has holes: {100 * holes:.1f} % of the pixels show through where the network shows something solid."
+        remedy = "Keep more voxels (a lower bake.weight_threshold, more bake.visibility_rays), or allow a larger asset (bake.max_mib)."
+        add("holes", "poor" if holes > MANY_HOLES else "usable", sentence, "Voxels that few rays see were left out.", remedy)
     floaters, own, excess = metrics["floaters"], metrics["network"]["floaters"] or 0.0, metrics["floaters_excess_error"]
-    if floaters is None or floaters - own <= FLOATERS or (excess is not None and excess <= 0):
-        return []
-    sentence = f"The asset has floaters: {100 * floaters:.1f} % of what it shows hangs before the network's surfaces (in the network itself {100 * own:.1f} %)."
-    usual = ("Faint voxels before the surfaces were kept.", "Drop faint voxels (a higher bake.weight_threshold) or small pieces (a higher bake.min_component).")
-    return [ResultProblem("floaters", "poor" if floaters - own > MANY_FLOATERS else "usable", sentence, *(_short(metrics) or usual), strip)]
+    if floaters is not None and floaters - own > FLOATERS and (excess is None or excess > 0):
+        shown = f"{100 * floaters:.1f} % of what it shows hangs before the network's surfaces (in the network itself {100 * own:.1f} %)."
+        remedy = "Drop faint voxels (a higher bake.weight_threshold) or small pieces (a higher bake.min_component)."
+        grade = "poor" if floaters - own > MANY_FLOATERS else "usable"
+        add("floaters", grade, f"The asset has floaters: {shown}", "Faint voxels before the surfaces were kept.", remedy)
+    return found
 
 
 def _of_sparse_points(metrics: Mapping[str, Any]) -> list[ResultProblem]:

@@ -95,8 +95,12 @@ def verdict_on(capture: Capture, looks: Mapping[str, Look], *, in_folder: int | 
     """
     names = [photo.camera.name for photo in capture.photos]
     total = max(len(names) + len(capture.rejected), in_folder or 0)
-    seen = None if capture.points is None or not any(capture.points.tracks) else parallax(capture.points, capture.photos)
-    counts, provenance = points_of_images(capture), to_builtins(capture.provenance)
+    provenance = to_builtins(capture.provenance)
+    seen = counts = None
+    if capture.points is not None and any(capture.points.tracks):
+        seen = parallax(capture.points, capture.photos)
+        # (C,) sparse points that each photograph sees
+        counts = np.bincount([photo for track in capture.points.tracks for photo in set(track)], minlength=len(capture.photos))
     figures: dict[str, Any] = {
         "photographs": total,
         "registered": len(names),
@@ -355,10 +359,3 @@ def _rows(capture: Capture, looks: Mapping[str, Look], counts: np.ndarray | None
             if name in same:
                 row["same_as"] = same[name]
     return dict(sorted(rows.items()))
-
-
-def points_of_images(capture: Capture) -> np.ndarray | None:
-    """(C,) sparse points that each photograph sees; None where nothing is known of it."""
-    if capture.points is None or not any(capture.points.tracks):
-        return None
-    return np.bincount([photo for track in capture.points.tracks for photo in set(track)], minlength=len(capture.photos))

@@ -39,10 +39,21 @@ def judge(job: Job, capture: Capture, scene: Scene, renders: bool, warn: Any) ->
         job.progress(done, len(files), "looking at images")
         with contextlib.suppress(UnreadableImage):
             grey = looks.grey_of(path)
-            own = looks.look(grey, read_quality(sources.get(name, path)))
-            seen[name] = replace(own, over_points=_stops_over(grey, *observed[name]) if name in observed else None)
-    found = verdict_on(capture, seen, in_folder=None if capture.kind == "photographs" or renders else _photographs_in_folder(job))
-    found = replace(found, figures={**found.figures, "coverage": _coverage(scene)})
+            seen[name] = looks.look(grey, read_quality(sources.get(name, path)))
+            if name in observed:
+                camera, xyz, light = observed[name]
+                at = np.nan_to_num(project(resized(camera, grey.shape[1], grey.shape[0]), xyz)[0], nan=-1.0, posinf=-1.0, neginf=-1.0)
+                seen[name] = replace(seen[name], over_points=looks.over_points(grey, at, light))
+    in_folder = None
+    if capture.kind != "photographs" and not renders:
+        assert job.source is not None
+        with contextlib.suppress(BadInput):
+            in_folder = len(photographs(Source(job.source, job.settings.allow_outside)))
+    found = verdict_on(capture, seen, in_folder=in_folder)
+    # Degrees of the sphere round the subject that the cameras stand on: round the upward axis, and of elevation in the middle and to either side of it.
+    around = coverage(np.array([view.camera.centre for view in scene.views]), np.asarray(scene.orbit.centre))
+    degrees = {name: round(getattr(around, name), 1) for name in ("arc", "elevation", "heights")}
+    found = replace(found, figures={**found.figures, "coverage": degrees})
     write_json(outputs.verdict, found.document())
     job.safe_point()
     lost = [name for name, _ in capture.rejected]
@@ -72,22 +83,3 @@ def _observed_points(capture: Capture) -> dict[str, tuple[Camera, np.ndarray, np
         for view in track:
             observed[view].append(point)
     return {photo.camera.name: (photo.camera, points.xyz[at], light[at]) for photo, at in zip(capture.photos, observed, strict=True)}
-
-
-def _stops_over(grey: np.ndarray, camera: Camera, xyz: np.ndarray, light: np.ndarray) -> float | None:
-    """`looks.over_points` of a photograph (H, W) uint8."""
-    pixels = project(resized(camera, grey.shape[1], grey.shape[0]), xyz)[0]
-    return looks.over_points(grey, np.nan_to_num(pixels, nan=-1.0, posinf=-1.0, neginf=-1.0), light)
-
-
-def _coverage(scene: Scene) -> dict[str, float]:
-    """Degrees of the sphere round the subject that the cameras stand on: round the upward axis, and of elevation in the middle and to either side of it."""
-    found = coverage(np.array([view.camera.centre for view in scene.views]), np.asarray(scene.orbit.centre))
-    return {"arc": round(found.arc, 1), "elevation": round(found.elevation, 1), "heights": round(found.heights, 1)}
-
-
-def _photographs_in_folder(job: Job) -> int | None:
-    assert job.source is not None
-    with contextlib.suppress(BadInput):
-        return len(photographs(Source(job.source, job.settings.allow_outside)))
-    return None

@@ -81,36 +81,26 @@ class Frame:
 
 
 class Video:
-    """An open video.
-
-    width, height  of its upright frames with square pixels, once there was one
-    stored         (width, height) of a frame as stored
-    duration       seconds, as the file states it; 0 where it does not
-    rate           frames a second, as the file states it
-    known_rate     whether it does; else `rate` is a usual one, and the times of frames alone tell
-    count          frames, as the file states or by its duration; an estimate
-    maker          the camera that took it, where the file says so
-    hdr            "HLG" or "PQ" where its colours are of high dynamic range, else ""
-    damaged        packets that could not be decoded, and frames that were left out for it
-    """
+    """An open video."""
 
     def __init__(self, container: Any, stream: Any) -> None:
         self._container, self._stream = container, stream
         about = {**container.metadata, **stream.metadata}
         names = [str(about.get(f"com.apple.quicktime.{part}") or about.get(f"com.android.{part}") or "") for part in ("make", "manufacturer", "model")]
-        self.maker = printable(" ".join(part for part in names if part), 100)
+        self.maker = printable(" ".join(part for part in names if part), 100)  # the camera that took it, where the file says so
+        # seconds, as the file states it; 0 where it does not
         self.duration = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else (container.duration or 0) / 1e6
         stated = float(stream.average_rate or stream.guessed_rate or 0)
-        self.known_rate = 0 < stated <= FASTEST
-        self.rate = stated if self.known_rate else USUAL
-        self.count = int(stream.frames or max(1, round(self.duration * self.rate)))
-        self.hdr = {_PQ: "PQ", _HLG: "HLG"}.get(stream.codec_context.color_trc, "")
-        self.damaged = 0
+        self.known_rate = 0 < stated <= FASTEST  # whether the file states its rate; else the times of frames alone tell
+        self.rate = stated if self.known_rate else USUAL  # frames a second
+        self.count = int(stream.frames or max(1, round(self.duration * self.rate)))  # frames, as the file states or by its duration; an estimate
+        self.hdr = {_PQ: "PQ", _HLG: "HLG"}.get(stream.codec_context.color_trc, "")  # where its colours are of high dynamic range
+        self.damaged = 0  # packets that could not be decoded, and frames that were left out for it
         self._matrix: tuple[int, int, int, int] | None = None
         aspect = stream.sample_aspect_ratio
         self._aspect = float(aspect) if aspect and 0.1 < float(aspect) < 10 else 1.0
-        self.width, self.height = 0, 0
-        self.stored = stream.codec_context.width, stream.codec_context.height
+        self.width, self.height = 0, 0  # of its upright frames with square pixels, once there was one
+        self.stored = stream.codec_context.width, stream.codec_context.height  # of a frame as stored
 
     def frames(self) -> Iterator[Frame]:
         """Those that are whole, in the order in which they are shown."""

@@ -123,7 +123,9 @@ class Refinement:
                 job.say(f"{budget.schedule.iterations} steps with {phase} fit into the budget")
             fraction = point.schedule.fraction(state.step)
             shown = self.log.record(state, phase, fraction, settings.refine_rays_per_batch, error, took, last=state.step == end)
-            self._report(phase, shown)
+            # in steps, or in seconds where there is a budget
+            done, total = (self.stopwatch.seconds, self.budget) if self.budget is not None else (state.step, point.schedule.begin(len(point.schedule.each)))
+            job.progress(min(done, total), total, f"refining {phase}", **shown)
             if clock() - self.written > CHECKPOINT_SECONDS:
                 self._save()
             try:
@@ -134,12 +136,6 @@ class Refinement:
             if state.step >= end:
                 break
             step_began = clock()
-
-    def _report(self, phase: str, shown: dict[str, Any]) -> None:
-        """Progress: in steps, or in seconds where there is a budget."""
-        schedule, step = self.point.schedule, self.point.state.step
-        done, total = (step, schedule.begin(len(schedule.each))) if self.budget is None else (self.stopwatch.seconds, self.budget)
-        self.job.progress(min(done, total), total, f"refining {phase}", **shown)
 
     def _save(self) -> None:
         self.point.seconds = self.stopwatch.seconds

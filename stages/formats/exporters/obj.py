@@ -31,7 +31,8 @@ def write_mesh(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP, pic
         write_parts(path, _coloured(mesh, frame))
         return
     colours, material = companions(path, picture)
-    files: dict[Path, Iterable[bytes]] = {colours: [texture], material: [_material(colours.name)], path: _textured(mesh, frame, material.name)}
+    described = f"newmtl {_MATERIAL}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 0\nmap_Kd {colours.name}\n".encode("ascii")
+    files: dict[Path, Iterable[bytes]] = {colours: [texture], material: [described], path: _textured(mesh, frame, material.name)}
     write_files(files)
 
 
@@ -57,7 +58,3 @@ def _textured(mesh: Mesh, frame: SourceFrame, material: str) -> Iterator[bytes]:
     yield from text_rows("vn %.5f %.5f %.5f\n", mesh.normals)
     yield f"usemtl {_MATERIAL}\n".encode("ascii")
     yield from text_rows("f %d/%d/%d %d/%d/%d %d/%d/%d\n", np.stack([mesh.faces, number, mesh.faces], 2).reshape(-1, 9) + 1)
-
-
-def _material(colours: str) -> bytes:
-    return f"newmtl {_MATERIAL}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 0\nmap_Kd {colours}\n".encode("ascii")

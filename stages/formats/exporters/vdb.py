@@ -90,7 +90,9 @@ def _colours(tree: NerfTree, kept: np.ndarray) -> np.ndarray:
     """(n, 3) float16, linear: for an asset that keeps its captured cameras, the mean over some of these, by how squarely each looks at the surface; else
     the median over views from outside, as in `surface_colours`. The harmonic of degree 0 is no such mean: unseen directions, as of a surface from
     within, are overfitted. docs/experiments/volume-colours.md"""
-    voxels, centres, eyes = np.flatnonzero(kept), voxel_centres(tree), _eyes(tree)
+    voxels, centres, captured, eyes = np.flatnonzero(kept), voxel_centres(tree), captured_of(tree.metadata), None
+    if captured is not None:  # (C, 3) where some of its cameras stood, spread over their path
+        eyes = captured.centres[np.unique(np.linspace(0, len(captured.centres) - 1, COLOUR_VIEWS).round().astype(int))]
     out = np.empty((len(voxels), 3), np.float16)
     for start in range(0, len(voxels), AT_ONCE):
         chosen = voxels[start : start + AT_ONCE]
@@ -106,15 +108,6 @@ def _colours(tree: NerfTree, kept: np.ndarray) -> np.ndarray:
             logits = (facing[..., None] * views).sum(axis=0) / facing.sum(axis=0)[:, None]
         out[start : start + AT_ONCE] = linear_from_srgb(1 / (1 + np.exp(-np.clip(logits, -80, 80))))
     return out
-
-
-def _eyes(tree: NerfTree) -> np.ndarray | None:
-    """(C, 3) where some of the captured cameras stood, spread over their path; None where the asset keeps none."""
-    found = captured_of(tree.metadata)
-    if found is None:
-        return None
-    eyes = found.centres
-    return np.asarray(eyes[np.unique(np.linspace(0, len(eyes) - 1, COLOUR_VIEWS).round().astype(int))])
 
 
 def _towards(points: np.ndarray, eye: np.ndarray) -> np.ndarray:

@@ -24,14 +24,8 @@ _REMEDY = "Export undistorted images and their cameras instead."
 
 
 def brown_camera(
-    name: str,
-    size: tuple[int, int],
-    focal: tuple[float, float],
-    centre: tuple[float, float],
-    pose: np.ndarray,
-    where: str,
-    radial: Sequence[float] = (),
-    tangential: tuple[float, float] = (0, 0),
+    name: str, size: tuple[int, int], focal: tuple[float, float], centre: tuple[float, float], pose: np.ndarray, where: str,
+    radial: Sequence[float] = (), tangential: tuple[float, float] = (0, 0),
 ) -> Camera:
     """
     focal       fx, fy, pixels

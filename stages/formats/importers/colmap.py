@@ -18,7 +18,7 @@ from stages.formats.importers.colmap_model import MAX_NAME, Model, PosedImage, c
 from stages.formats.importers.frames import CameraOf, Frame
 from stages.formats.importers.listed import Listed, ListFormat
 from stages.formats.importers.source import Source, abbreviated
-from stages.io.capture import Capture, SparsePoints
+from stages.io.capture import Capture
 
 _MODEL_PLACES = (".", "sparse", "sparse/*", "colmap", "colmap/sparse", "colmap/sparse/*", "dense/sparse", "dense/*/sparse", "model", "models/*")
 _IMAGE_PLACES = ("images", "input", "rgb", "photos", ".", "../images", "../../images")
@@ -62,10 +62,14 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
         if others:
             counts = [f"{source.name_of(other)} ({count_images(_files(source, other))} images)" for other in others]
             warnings.append(f"{where} with {len(model.images)} images is used; there is also {abbreviated(counts)}.")
-        points = _points(files, {frame.own: index for index, frame in enumerate(kept)})
-        if points is None:
+        points, places = read_points(files), {frame.own: index for index, frame in enumerate(kept)}
+        if points is None or not len(points.xyz):
             warnings.append(f"{where}: no points3D; the bounds are estimated from the cameras alone.")
-        return replace(capture, points=points, reprojection_error=_mean_error(points), warnings=(*capture.warnings, *warnings))
+            return replace(capture, warnings=(*capture.warnings, *warnings))
+        tracks = tuple(tuple(sorted(places[number] for number in track if number in places)) for track in points.tracks)
+        known = points.error[np.isfinite(points.error) & (points.error >= 0)]
+        error = float(known.mean()) if len(known) else None  # as COLMAP states it
+        return replace(capture, points=replace(points, tracks=tracks), reprojection_error=error, warnings=(*capture.warnings, *warnings))
 
     facts: dict[str, object] = {"model": where, "registered": len(model.images), "cameras": len(model.cameras)}
     remedy = "Put the images into a folder `images` next to the model."
@@ -75,23 +79,6 @@ def _listed(source: Source, signs: Sequence[Path]) -> Listed:
 def _camera(model: Model, image: PosedImage, where: str) -> CameraOf:
     lens, pose = model.cameras[image.camera], pose_from_colmap(np.array(image.quaternion), np.array(image.translation))
     return lambda name, size: lenses.validated(replace(lens, name=name, world_from_camera=pose), f"{where}: camera {image.camera}")
-
-
-def _points(files: Sequence[Path], places: dict[int, int]) -> SparsePoints | None:
-    """Those of the model, in the photos at these places by their images' numbers."""
-    points = read_points(files)
-    if points is None or not len(points.xyz):
-        return None
-    tracks = tuple(tuple(sorted(places[number] for number in track if number in places)) for track in points.tracks)
-    return replace(points, tracks=tracks)
-
-
-def _mean_error(points: SparsePoints | None) -> float | None:
-    """As COLMAP states it: over the points whose error is known."""
-    if points is None:
-        return None
-    known = points.error[np.isfinite(points.error) & (points.error >= 0)]
-    return float(known.mean()) if len(known) else None
 
 
 FORMAT = ListFormat("colmap", "cameras and images (.bin or .txt) here, in sparse/ or sparse/0", _models, _listed)

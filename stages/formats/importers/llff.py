@@ -59,16 +59,6 @@ def _signs(source: Source) -> list[Path]:
     return [path for path in [source.root / POSES] if path.is_file()]
 
 
-def image_folders(folder: Path) -> dict[int, Path]:
-    """Reduction factor -> folder of images: images/ is 1, images_4/ is 4."""
-    folders = {1: folder / "images"} if images_in(folder / "images") else {}
-    for entry in sorted(folder.iterdir()):
-        match = re.fullmatch(r"images_(\d{1,4})", entry.name)
-        if match and int(match[1]) > 0 and images_in(entry):
-            folders.setdefault(int(match[1]), entry)
-    return dict(sorted(folders.items()))
-
-
 def _rows(source: Source) -> np.ndarray:
     return read_rows(source.real(source.root / POSES))
 
@@ -123,7 +113,12 @@ def rows_of_npy(data: bytes, where: str, columns: int, what: str, remedy: str) -
 
 def _images(source: Source, count: int) -> tuple[list[Path], int, list[str]]:
     """The images in the order of the rows, the reduction factor of their folder, and warnings."""
-    folders = image_folders(source.root)
+    folders = {1: source.root / "images"} if images_in(source.root / "images") else {}  # by the reduction factor: images_4/ is 4
+    for entry in sorted(source.root.iterdir()):
+        match = re.fullmatch(r"images_(\d{1,4})", entry.name)
+        if match and int(match[1]) > 0 and images_in(entry):
+            folders.setdefault(int(match[1]), entry)
+    folders = dict(sorted(folders.items()))
     if not folders:
         raise BadInput(f"{source.root}: {POSES} without images: expected a folder images, images_4, images_8 ... next to it.")
     counts = {factor: len(images_in(folder)) for factor, folder in folders.items()}

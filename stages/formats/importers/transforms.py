@@ -12,7 +12,7 @@ becomes sparse points where images agree on it. The capture's frame is that of t
 
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -43,7 +43,6 @@ _NERFSTUDIO_KEYS = (*_NERFSTUDIO_FACTS, "orientation_override", "train_filenames
 _NGP_FACTS = ("aabb_scale", "scale", "offset")
 _NGP_KEYS = (*_NGP_FACTS, "is_fisheye", "from_na", "n_extra_learnable_dims", "enable_depth_loading", "integer_depth_scale", "render_aabb")
 _NGP_SCALE = 0.33  # of instant-ngp, where the file states none
-
 
 Documents = list[tuple[Path, dict[str, Any]]]  # the files of a data set, and what they hold
 
@@ -136,22 +135,19 @@ def _frames(documents: Documents) -> list[Frame]:
     listed = []
     for file, document in documents:
         split_of_file = SPLIT_FILES.get(file.name) if len(documents) > 1 else None
-        split_of_name = dict(_listed_splits(document, file))
+        split_of_name: dict[str, str] = {}
+        for split in ("train", "val", "test"):
+            names = document.get(f"{split}_filenames", [])
+            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+                raise BadInput(f"{file}: {split}_filenames is not a list of names.")
+            split_of_name |= dict.fromkeys(map(_plain, names), split)
         for index, entry in enumerate(document["frames"]):
             if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
                 raise BadInput(f"{file}: frame {index} has no `file_path`. Write the data set again, or take it out.")
             name = entry["file_path"]
-            where, split = f"{file.name}: frame {index} ({printable(name, MAX_NAME)})", split_of_file or split_of_name.get(_plain(name))
-            listed.append(Frame(name, file.parent, where, camera_of(document, entry, where), split=split, own=(document, entry)))
+            where, own = f"{file.name}: frame {index} ({printable(name, MAX_NAME)})", (document, entry)
+            listed.append(Frame(name, file.parent, where, camera_of(*own, where), split=split_of_file or split_of_name.get(_plain(name)), own=own))
     return listed
-
-
-def _listed_splits(document: dict[str, Any], file: Path) -> Iterator[tuple[str, str]]:
-    for split in ("train", "val", "test"):
-        names = document.get(f"{split}_filenames", [])
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise BadInput(f"{file}: {split}_filenames is not a list of names.")
-        yield from ((_plain(name), split) for name in names)
 
 
 def _plain(name: str) -> str:
@@ -258,15 +254,6 @@ def _camera(given: dict[str, Any], name: str, actual: tuple[int, int], pose: np.
             raise BadInput(f"{where}: lens model {key} is not supported. Undistort the images first, e.g. to a pinhole or OPENCV_FISHEYE camera.")
     width, height = (number("w"), number("h")) if "w" in given and "h" in given else actual
     stated = lenses.image_size(width, height, where, "Correct w and h.")
-    fx, fy = _focal(given, number, width, height, where)
-    named = {"f": fx, "fx": fx, "fy": fy, "cx": number("cx", default=width / 2), "cy": number("cy", default=height / 2)}
-    named |= {key: number(key) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")}
-    model = _model(given, named, where)
-    camera = Camera(name, *stated, model, tuple(named[parameter] for parameter in MODELS[model]), pose)
-    return lenses.validated(camera, where)
-
-
-def _focal(given: dict[str, Any], number: Any, width: float, height: float, where: str) -> tuple[float, float]:
     focal = {}
     for axis, side in (("x", width), ("y", height)):
         if f"fl_{axis}" in given:
@@ -279,7 +266,12 @@ def _focal(given: dict[str, Any], number: Any, width: float, height: float, wher
     if not focal:
         raise BadInput(f"{where}: no focal length: expected fl_x or camera_angle_x, at the top or in the frame.")
     fx = focal.get("x", focal.get("y", 0.0))
-    return fx, focal.get("y", fx)
+    fy = focal.get("y", fx)
+    named = {"f": fx, "fx": fx, "fy": fy, "cx": number("cx", default=width / 2), "cy": number("cy", default=height / 2)}
+    named |= {key: number(key) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")}
+    model = _model(given, named, where)
+    camera = Camera(name, *stated, model, tuple(named[parameter] for parameter in MODELS[model]), pose)
+    return lenses.validated(camera, where)
 
 
 def _model(given: dict[str, Any], named: dict[str, float], where: str) -> str:

@@ -38,14 +38,7 @@ def pairs_of(weak: Sequence[int], partners: Sequence[Pair], overlaps: Mapping[tu
 
 
 def add_matches(
-    place: Path,
-    images: Sequence[WorkImage],
-    pairs: Sequence[Pair],
-    networks: tuple[Path, Path],
-    *,
-    seed: int,
-    threads: int,
-    progress: Progress,
+    place: Path, images: Sequence[WorkImage], pairs: Sequence[Pair], networks: tuple[Path, Path], *, seed: int, threads: int, progress: Progress,
     safe_point: SafePoint,
 ) -> None:
     """Append a detector's features to those in the database of a scratch folder, and the matches of these pairs to theirs; all are verified together.

@@ -13,8 +13,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.errors import BadInput, UsageError
-from stages.io.network_file import in_words, open_network, run_network
+from pipeline.errors import UsageError
+from stages.io.network_file import Network, in_words
 
 OPTION = "--features-model"
 LONGEST_SIDE = 1024  # px of a picture that a detector is given, where it takes any size: as LightGlue's authors have it
@@ -34,21 +34,18 @@ class Features:
     descriptors: np.ndarray  # (N, D) float32
 
 
-class Detector:
-    """Raises UsageError where onnxruntime or the file is missing, BadInput where the file holds no such network."""
-
+class Detector(Network):
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self._session = open_network(path, OPTION, 1, self._refused)  # one thread: pictures are worked on side by side, and no sum depends on their number
-        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
-        images = [each for each in inputs if len(each.shape) == 4]
-        extra = {each.name for each in inputs} - {each.name for each in images}
+        expected = "Expected ALIKED: image in; keypoints, descriptors and scores out. A file that holds detector and matcher has to be exported as two."
+        super().__init__(path, OPTION, 1, "detects features", expected)  # one thread: pictures are worked on side by side, and no sum depends on their number
+        images = [each for each in self.inputs if len(each.shape) == 4]
+        extra = {each.name for each in self.inputs} - {each.name for each in images}
         of_colours = [each for each in images if each.type == "tensor(float)" and (each.shape[1] == 3 or not isinstance(each.shape[1], int))]
         if len(images) != 1 or not of_colours or not extra <= {"max_keypoints", "min_score"}:
-            raise self._refused(f"it takes {in_words(inputs)}")
-        self._given = {each.name for each in outputs}
+            raise self.refused(f"it takes {in_words(self.inputs)}")
+        self._given = {each.name for each in self.outputs}
         if not {"keypoints", "descriptors"} <= self._given:
-            raise self._refused(f"it gives {in_words(outputs)}")
+            raise self.refused(f"it gives {in_words(self.outputs)}")
         self._input, self._extra = images[0].name, extra
         self._fixed = [side if isinstance(side, int) and side > 0 else None for side in images[0].shape[2:]]  # height, width
 
@@ -65,13 +62,13 @@ class Detector:
         extra: dict[str, np.ndarray] = {"max_keypoints": np.array(most, np.int64), "min_score": np.array(MIN_SCORE, np.float32)}
         inputs |= {name: extra[name] for name in self._extra}
         names = ["keypoints", "descriptors", *(["scores"] if "scores" in self._given else [])]
-        found = dict(zip(names, run_network(self._session, names, inputs, self._refused), strict=True))
+        found = dict(zip(names, self.run(names, inputs), strict=True))
         keypoints, descriptors = (found[name][0] if found[name].ndim == 3 and len(found[name]) == 1 else found[name] for name in names[:2])
         scores = np.asarray(found.get("scores", np.ones(len(keypoints)))).reshape(-1)
         if keypoints.ndim != 2 or keypoints.shape[1] != 2 or descriptors.ndim != 2 or not len(keypoints) == len(descriptors) == len(scores):
-            raise self._refused(f"it gives key points {keypoints.shape}, descriptors {descriptors.shape} and scores {scores.shape}")
+            raise self.refused(f"it gives key points {keypoints.shape}, descriptors {descriptors.shape} and scores {scores.shape}")
         if not all(np.isfinite(each).all() for each in (keypoints, descriptors, scores)):
-            raise self._refused("it gives what is no number")
+            raise self.refused("it gives what is no number")
         seen = np.asarray(keypoints, np.float64)
         if np.abs(seen).max(initial=0.0) <= _IN_BOUNDS:
             seen = (seen + 1) / 2 * (np.array(padded[::-1]) - 1)
@@ -83,23 +80,16 @@ class Detector:
         kept = kept[np.argsort(-scores[kept], kind="stable")[:most]]
         return Features(xy[kept], seen[kept].astype(np.float32), (small[1], small[0]), np.asarray(descriptors[kept], np.float32))
 
-    def _refused(self, why: str) -> BadInput:
-        expected = "Expected ALIKED: image in; keypoints, descriptors and scores out. A file that holds detector and matcher has to be exported as two."
-        return BadInput(f"{OPTION} {self._path}: no network that detects features ({why}). {expected}")
 
-
-class Matcher:
-    """Raises UsageError where onnxruntime or the file is missing, BadInput where the file holds no such network."""
-
+class Matcher(Network):
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self._session = open_network(path, OPTION, 1, self._refused)
-        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
-        names, features, sizes = {each.name for each in inputs}, {"kpts0", "kpts1", "desc0", "desc1"}, {"image_size0", "image_size1"}
+        expected = "Expected LightGlue: kpts0, kpts1, desc0, desc1 in, as LightGlue-ONNX or COLMAP export it; matches0 and mscores0 out."
+        super().__init__(path, OPTION, 1, "matches features", expected)
+        names, features, sizes = {each.name for each in self.inputs}, {"kpts0", "kpts1", "desc0", "desc1"}, {"image_size0", "image_size1"}
         if names not in (features, features | sizes):
-            raise self._refused(f"it takes {in_words(inputs)}")
-        if not {"matches0", "mscores0"} <= {each.name for each in outputs}:
-            raise self._refused(f"it gives {in_words(outputs)}")
+            raise self.refused(f"it takes {in_words(self.inputs)}")
+        if not {"matches0", "mscores0"} <= {each.name for each in self.outputs}:
+            raise self.refused(f"it gives {in_words(self.outputs)}")
         self._in_pixels = names != features
 
     def matches(self, one: Features, other: Features) -> np.ndarray:
@@ -113,13 +103,13 @@ class Matcher:
             inputs[f"desc{k}"] = each.descriptors[None]
             if self._in_pixels:
                 inputs[f"image_size{k}"] = size[None]
-        matches, scores = run_network(self._session, ["matches0", "mscores0"], inputs, self._refused)
+        matches, scores = self.run(["matches0", "mscores0"], inputs)
         pairs, scores = self._pairs(matches, len(one.xy)), scores.reshape(-1)
         if len(pairs) != len(scores):
-            raise self._refused(f"it gives matches {matches.shape} and scores {scores.shape}")
+            raise self.refused(f"it gives matches {matches.shape} and scores {scores.shape}")
         pairs = pairs[(scores >= MIN_SCORE) & (pairs >= 0).all(1)]
         if (pairs >= (len(one.xy), len(other.xy))).any():
-            raise self._refused("it matches features that there are not")
+            raise self.refused("it matches features that there are not")
         return np.asarray(pairs, np.uint32)
 
     def _pairs(self, matches: np.ndarray, count: int) -> np.ndarray:
@@ -129,12 +119,8 @@ class Matcher:
         if found.shape == (count,):
             return np.stack([np.arange(count), found], 1)
         if found.ndim != 2 or found.shape[1] != 2:
-            raise self._refused(f"it gives matches {matches.shape}; expected (M, 2), or one for each of {count} features")
+            raise self.refused(f"it gives matches {matches.shape}; expected (M, 2), or one for each of {count} features")
         return found
-
-    def _refused(self, why: str) -> BadInput:
-        expected = "Expected LightGlue: kpts0, kpts1, desc0, desc1 in, as LightGlue-ONNX or COLMAP export it; matches0 and mscores0 out."
-        return BadInput(f"{OPTION} {self._path}: no network that matches features ({why}). {expected}")
 
 
 def given_networks(detector: str, matcher: str) -> tuple[Path, Path] | None:

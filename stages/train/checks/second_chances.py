@@ -105,6 +105,7 @@ def _train(
     job: Job, s: Scene, settings: TrainSettings, pixels: Pixels, held: Sequence[HeldOutView], depth: SparseDepthRays | None, name: str
 ) -> EarlyResult | None:
     """The result of a short training on a scene; None where no pixel can be compared, or masks leave none to train on."""
+    # Of the given settings those of what is learned, not of how much.
     kept = ("seed", "near_plane", "far_plane", "min_views", "exposure", "background_color")
     views, small = views_of(s, "train"), replace(SMALL, **{name: getattr(settings, name) for name in kept})
     own = _with_views(pixels, views)

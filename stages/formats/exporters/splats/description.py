@@ -23,7 +23,7 @@ from pipeline.text import printable
 from stages.formats.exporters.splats import gltf, spz
 from stages.io.meshes.geometry import AT_ONCE, Damaged, exactly, opened
 from stages.io.meshes.glb import Glb
-from stages.io.meshes.ply import Element, read_header
+from stages.io.meshes.ply import read_header
 
 MAX_GLTF_JSON = 2**24  # bytes; of Gaussians it takes a few thousand
 MAX_SOG_JSON = 2**20  # bytes; it takes ten thousand
@@ -103,8 +103,12 @@ def _ply(file: BinaryIO, size: int) -> _Found | None:
         return None
     if kind == "ascii":
         raise Damaged("a PLY of 3D Gaussians that is not binary; expected 'format binary_little_endian 1.0'")
-    count, rows = _ply_rows(elements[0])
-    start = file.tell()
+    if elements[0].name != "vertex":
+        raise Damaged("its first element is not 'element vertex N'")
+    columns, count = [(each.name, each.type) for each in elements[0].properties], elements[0].count
+    if any(each.counts is not None for each in elements[0].properties) or len(dict(columns)) < len(columns):
+        raise Damaged("its vertices have a property list, or a column twice; expected columns of numbers, each once")
+    rows, start = np.dtype(columns), file.tell()
     if _PLY_NAMES - {*(rows.names or ())}:
         raise Damaged("its vertices lack columns of Gaussians, which other elements have")
     if size < start + count * rows.itemsize or (size > start + count * rows.itemsize and len(elements) == 1):
@@ -120,16 +124,6 @@ def _ply(file: BinaryIO, size: int) -> _Found | None:
             found.scales.add(np.exp(np.stack([part[f"scale_{k}"] for k in range(3)], axis=1).astype(np.float64)))
             found.opacities.add(1 / (1 + np.exp(-part["opacity"].astype(np.float64)))[:, None])
     return found
-
-
-def _ply_rows(element: Element) -> tuple[int, np.dtype[Any]]:
-    """The number of the vertices, which have to come first, and a row of them."""
-    if element.name != "vertex":
-        raise Damaged("its first element is not 'element vertex N'")
-    columns = [(each.name, each.type) for each in element.properties]
-    if any(each.counts is not None for each in element.properties) or len(dict(columns)) < len(columns):
-        raise Damaged("its vertices have a property list, or a column twice; expected columns of numbers, each once")
-    return element.count, np.dtype(columns)
 
 
 # SPZ

@@ -54,6 +54,15 @@ def moved(gaussians: Gaussians, target_from_source: Similarity) -> Gaussians:
         )
 
 
+def smallest_three(quaternions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) which of the four numbers of unit quaternions (N, 4) is the largest, and (N, 3) float64 the others of that quaternion whose largest is positive."""
+    q = quaternions.astype(np.float64)
+    largest = np.abs(q).argmax(axis=1)
+    q = np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -q, q)
+    others = np.array([[k for k in range(4) if k != which] for which in range(4)])[largest]
+    return largest, np.take_along_axis(q, others, 1)
+
+
 def turned_harmonics(harmonics: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Coefficients (N, K, 3) of the function that has at R d the value that the given ones have at d: each degree turns into itself."""
     degree = round(harmonics.shape[1] ** 0.5) - 1

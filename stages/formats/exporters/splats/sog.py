@@ -29,7 +29,7 @@ from efficientnerf.asset.quantisation import clustered
 from efficientnerf.splats.gaussians import Gaussians
 from efficientnerf.splats.merging import morton_codes
 from pipeline.files import atomic
-from stages.formats.exporters.splats.frames import check_gaussians, with_y_down
+from stages.formats.exporters.splats.frames import check_gaussians, smallest_three, with_y_down
 from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame
 
 VERSION = 2
@@ -99,12 +99,8 @@ def coded(values: np.ndarray) -> tuple[list[float], np.ndarray]:
 
 def rotation_codes(rotations: np.ndarray) -> np.ndarray:
     """(N, 4) codes of unit quaternions w x y z."""
-    q = rotations.astype(np.float64)
-    largest = np.abs(q).argmax(axis=1)
-    q = np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -q, q)
-    others = np.array([[k for k in range(4) if k != which] for which in range(4)])[largest]
-    rest = np.round((np.take_along_axis(q, others, 1) * 2**0.5 + 1) * 127.5)
-    return np.concatenate([np.clip(rest, 0, 255), largest[:, None] + ROTATION_TAG], axis=1)
+    largest, rest = smallest_three(rotations)
+    return np.concatenate([np.clip(np.round((rest * 2**0.5 + 1) * 127.5), 0, 255), largest[:, None] + ROTATION_TAG], axis=1)
 
 
 def palette_of(vectors: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

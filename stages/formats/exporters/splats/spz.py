@@ -25,7 +25,7 @@ import numpy as np
 
 from efficientnerf.splats.gaussians import Gaussians
 from pipeline.errors import BadInput
-from stages.formats.exporters.splats.frames import check_gaussians, with_y_up
+from stages.formats.exporters.splats.frames import check_gaussians, smallest_three, with_y_up
 from stages.formats.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, write_parts
 
 if sys.version_info >= (3, 14):
@@ -88,11 +88,7 @@ def scales(raw: bytes) -> np.ndarray:
 
 def rotation_codes(rotations: np.ndarray) -> np.ndarray:
     """(N,) uint32 of unit quaternions w x y z: the number of the largest of x y z w, then the others in that order, a sign and 9 bits each."""
-    q = rotations[:, [1, 2, 3, 0]].astype(np.float64)
-    largest = np.abs(q).argmax(axis=1)
-    q = np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -q, q)
-    others = np.array([[k for k in range(4) if k != which] for which in range(4)])[largest]
-    rest = np.take_along_axis(q, others, 1)
+    largest, rest = smallest_three(rotations[:, [1, 2, 3, 0]])
     size = np.minimum(np.floor(np.abs(rest) * (511 * 2**0.5) + 0.5), 511).astype(np.uint32)
     code = largest.astype(np.uint32)
     for column in range(3):

@@ -69,9 +69,14 @@ def decomposed(projection: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarr
 
 def intrinsics_of(path: Path) -> tuple[np.ndarray, tuple[int, int] | None]:
     """K (3, 3), and (width, height) where the file states it. Raises BadInput."""
+    where = path.name
     if path.suffix == ".json":
-        return _open3d_intrinsics(path)
-    found, where = read_text(path, MAX_CAMERA_BYTES).split(), path.name
+        # of Open3D: width, height, and intrinsic_matrix, column by column
+        document = json_file.read_object(path, where, REMEDY)
+        matrix = json_file.numbers(document.get("intrinsic_matrix"), 9, f"{where}: intrinsic_matrix, column by column,", REMEDY)
+        width, height = (json_file.number(document, key, where, REMEDY) for key in ("width", "height"))
+        return np.array(matrix).reshape(3, 3).T, lenses.image_size(width, height, where, REMEDY)
+    found = read_text(path, MAX_CAMERA_BYTES).split()
     if len(found) in (9, 16):
         side = 3 if len(found) == 9 else 4
         return numbers(found, len(found), where).reshape(side, side)[:3, :3], None
@@ -83,14 +88,6 @@ def intrinsics_of(path: Path) -> tuple[np.ndarray, tuple[int, int] | None]:
     focal, cx, cy = numbers(found[:3], 3, where)
     height, width = numbers(found[-2:], 2, where)
     return np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]]), lenses.image_size(width, height, where, REMEDY)
-
-
-def _open3d_intrinsics(path: Path) -> tuple[np.ndarray, tuple[int, int]]:
-    """Of a JSON file: width, height, and intrinsic_matrix, column by column."""
-    document, where = json_file.read_object(path, path.name, REMEDY), path.name
-    matrix = json_file.numbers(document.get("intrinsic_matrix"), 9, f"{where}: intrinsic_matrix, column by column,", REMEDY)
-    width, height = (json_file.number(document, key, where, REMEDY) for key in ("width", "height"))
-    return np.array(matrix).reshape(3, 3).T, lenses.image_size(width, height, where, REMEDY)
 
 
 def archive_matrices(path: Path, where: str) -> dict[str, np.ndarray]:
@@ -107,16 +104,12 @@ def archive_matrices(path: Path, where: str) -> dict[str, np.ndarray]:
                 if len(found) >= 2 * MAX_FRAMES:
                     raise BadInput(f"{where}: more than {MAX_FRAMES} cameras; that many are not read.")
                 with archive.open(info) as entry:
-                    found[match[1]] = _archive_matrix(entry.read(MAX_MATRIX_BYTES + 1), f"{where}: {match[1]}")
+                    data, place = entry.read(MAX_MATRIX_BYTES + 1), f"{where}: {match[1]}"
+                if len(data) > MAX_MATRIX_BYTES:
+                    raise BadInput(f"{place}: more than {MAX_MATRIX_BYTES} bytes; expected a 4x4 matrix. {REMEDY}")
+                found[match[1]] = rows_of_npy(data, place, 4, "4x4 matrices", REMEDY)
+                if len(found[match[1]]) != 4:
+                    raise BadInput(f"{place}: {len(found[match[1]])} rows; expected a 4x4 matrix. {REMEDY}")
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
         raise BadInput(f"{where}: not a NumPy archive, or truncated ({printable(error, 80)}). {REMEDY}") from None
     return found
-
-
-def _archive_matrix(data: bytes, where: str) -> np.ndarray:
-    if len(data) > MAX_MATRIX_BYTES:
-        raise BadInput(f"{where}: more than {MAX_MATRIX_BYTES} bytes; expected a 4x4 matrix. {REMEDY}")
-    matrix = rows_of_npy(data, where, 4, "4x4 matrices", REMEDY)
-    if len(matrix) != 4:
-        raise BadInput(f"{where}: {len(matrix)} rows; expected a 4x4 matrix. {REMEDY}")
-    return matrix

@@ -144,7 +144,10 @@ SCANNER_AGAIN = "Export from 3D Scanner App again, as All Data."
 
 def _scanner_signs(source: Source) -> Sequence[Path]:
     """The JSON files of the pictures that have one."""
-    listed = (path.with_suffix(".json") for path in _scanner_pictures(_scanner_place(source)))
+    # The frames lie in the source, or in what is in it where that is one folder and nothing else, as the app packs them.
+    inside = list(islice((path for path in source.root.iterdir() if not path.name.startswith((".", "__MACOSX"))), 2))
+    place = inside[0] if len(inside) == 1 and inside[0].is_dir() and not inside[0].is_symlink() else source.root
+    listed = (path.with_suffix(".json") for path in _scanner_pictures(place))
     return [source.check_inside(path) for path in listed if path.is_file()]
 
 
@@ -176,12 +179,6 @@ def _scanner(source: Source, signs: Sequence[Path]) -> Listed:
         return depth_file(source, place / f"depth_{digits}.png", MILLIMETRE, place / f"conf_{digits}.png", SCANNER_HIGH, SENSOR_RANGE)
 
     return Listed(where, listed, signs, rejected, up=Y_UP, metric=True, facts=facts, depth=depth)
-
-
-def _scanner_place(source: Source) -> Path:
-    """The folder of the frames: the source, or what is in it where that is one folder and nothing else, as the app packs them."""
-    inside = list(islice((path for path in source.root.iterdir() if not path.name.startswith((".", "__MACOSX"))), 2))
-    return inside[0] if len(inside) == 1 and inside[0].is_dir() and not inside[0].is_symlink() else source.root
 
 
 def _scanner_pictures(place: Path) -> list[Path]:

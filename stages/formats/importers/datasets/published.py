@@ -138,7 +138,21 @@ def _is_kapture(source: Source, signs: Sequence[Path]) -> bool:
 
 
 def _kapture(source: Source, signs: Sequence[Path]) -> Listed:
-    devices = _kapture_devices(source)
+    devices = _Devices()
+    for where, values in _rows(source, SENSORS, 3):
+        if values[2] != "camera":
+            continue
+        model, params = (values[3] if len(values) > 3 else ""), values[4:]
+        if (count := count_parameters(model)) is None:
+            supported = ", ".join([*MODELS, *FISHEYE])
+            raise BadInput(f"{where}: camera model {printable(model, 40) or 'missing'}; supported are {supported}. Undistort the images first.")
+        lens = numbers(params, 2 + count, where)
+        devices.lenses[values[0]] = Camera("", *lenses.image_size(lens[0], lens[1], where, REMEDY), *as_traced(model, tuple(lens[2:].tolist())), np.eye(4))
+    for where, values in _rows(source, RIGS, 9):
+        devices.mounts.setdefault(values[1], []).append((values[0], _transform(values[2:9], where)))
+    for where, values in _rows(source, TRAJECTORIES, 9):
+        if "" not in values[2:9]:  # only a place, or only a direction, is known
+            devices.poses[values[0], values[1]] = _transform(values[2:9], where)
     listed, unposed = [], []
     for where, (timestamp, sensor, name, *_) in _rows(source, RECORDS, 3):
         if sensor not in devices.lenses:
@@ -175,25 +189,6 @@ def _transform(values: list[str], where: str) -> np.ndarray:
     if not 0.99 < length < 1.01:
         raise BadInput(f"{where}: quaternion of length {length:g}, expected 1. {REMEDY}")
     return np.linalg.inv(pose_from_colmap(found[:4], found[4:]))
-
-
-def _kapture_devices(source: Source) -> _Devices:
-    devices = _Devices()
-    for where, values in _rows(source, SENSORS, 3):
-        if values[2] != "camera":
-            continue
-        model, params = (values[3] if len(values) > 3 else ""), values[4:]
-        if (count := count_parameters(model)) is None:
-            supported = ", ".join([*MODELS, *FISHEYE])
-            raise BadInput(f"{where}: camera model {printable(model, 40) or 'missing'}; supported are {supported}. Undistort the images first.")
-        lens = numbers(params, 2 + count, where)
-        devices.lenses[values[0]] = Camera("", *lenses.image_size(lens[0], lens[1], where, REMEDY), *as_traced(model, tuple(lens[2:].tolist())), np.eye(4))
-    for where, values in _rows(source, RIGS, 9):
-        devices.mounts.setdefault(values[1], []).append((values[0], _transform(values[2:9], where)))
-    for where, values in _rows(source, TRAJECTORIES, 9):
-        if "" not in values[2:9]:  # only a place, or only a direction, is known
-            devices.poses[values[0], values[1]] = _transform(values[2:9], where)
-    return devices
 
 
 def _kapture_points(source: Source, places: dict[str, int]) -> SparsePoints | None:

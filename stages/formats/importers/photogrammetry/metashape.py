@@ -50,16 +50,6 @@ def _listed(source: Source, found: Sequence[Path]) -> Listed:
         raise BadInput(f"{where}: no chunk with cameras. {_ALIGN}")
     chunk = max(chunks, key=lambda one: sum(camera.find("transform") is not None for camera in _cameras(one)))  # the first of equals
     warnings = [f"{where}: {len(chunks)} chunks; the one with most cameras is used."] if len(chunks) > 1 else []
-    return _project(source, found[0], where, chunk, warnings)
-
-
-def _cameras(chunk: Element) -> Iterator[Element]:
-    cameras = chunk.find("cameras")
-    if cameras is not None:
-        yield from cameras.iter("camera")  # within groups, too
-
-
-def _project(source: Source, file: Path, where: str, chunk: Element, warnings: list[str]) -> Listed:
     cameras = list(_cameras(chunk))
     frames.check_count(len(cameras), where)
     components = {one.get("id"): one for one in chunk.iterfind("components/component")}
@@ -94,7 +84,13 @@ def _project(source: Source, file: Path, where: str, chunk: Element, warnings: l
             camera = replace(sensor(one.get("sensor_id")), world_from_camera=world.pose(pose))
             listed.append(frames.Frame(label, source.root, place, frames.stated(camera), bare=True))
     facts: dict[str, object] = {"label": printable(chunk.get("label") or "", frames.MAX_NAME), "sensors": len(sensors)}
-    return Listed(where, listed, [file], rejected, warnings, up, metric=metric, facts=facts)
+    return Listed(where, listed, [found[0]], rejected, warnings, up, metric=metric, facts=facts)
+
+
+def _cameras(chunk: Element) -> Iterator[Element]:
+    cameras = chunk.find("cameras")
+    if cameras is not None:
+        yield from cameras.iter("camera")  # within groups, too
 
 
 def _sensor(element: Element | None, where: str, warnings: list[str]) -> Camera:
