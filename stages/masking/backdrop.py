@@ -48,20 +48,11 @@ def without_white_backdrop(job: Job, capture: Capture, paths: Mapping[str, Path]
     masked = replace(with_masks(capture, masks), silhouettes=kind, points=points.only(reliable))
     if 1 - points_of_object(masked, reader).mean() > MAX_CONTRADICTED or share_that_fits(masked, kind, reader) < MIN_AGREEING:
         return capture
-    _keep_hull(job, masked, reader)
-    in_white = 1 - float(points_of_object(masked, reader).mean())
-    if in_white > MAX_CONTRADICTED:
-        return capture
-    job.say("the subject stands before a white backdrop without a feature, which is left out; --mask off uses the full images", points_in_backdrop=in_white)
-    return replace(capture, photos=masked.photos, provenance=structs.replace(capture.provenance, background="white"))
-
-
-def _keep_hull(job: Job, capture: Capture, reader: PhotoReader) -> None:
-    """Leave out of the capture's mask files what lies more than MARGIN from the projection of their visual hull."""
-    chosen = [(photo, mask >= 128) for photo in chosen_photos(capture.photos) if (mask := reader.mask(photo)) is not None]
-    hull = hull_of(capture, chosen)
+    # What lies more than MARGIN from the projection of the visual hull is left out of the mask files.
+    chosen = [(photo, mask >= 128) for photo in chosen_photos(masked.photos) if (mask := reader.mask(photo)) is not None]
+    hull = hull_of(masked, chosen)
     assert hull is not None  # silhouettes fit to it
-    for photo in capture.photos:
+    for photo in masked.photos:
         job.safe_point()
         small = reader.mask(photo)
         if photo.mask is None or small is None:
@@ -69,6 +60,11 @@ def _keep_hull(job: Job, capture: Capture, reader: PhotoReader) -> None:
         near = cv2.dilate(projection(*hull, photo.camera, small.shape).astype(np.float32), np.ones((2 * MARGIN + 1,) * 2, np.uint8))
         mask = read_png(photo.mask)
         write_png(np.where(cv2.resize(near, mask.shape[::-1], interpolation=cv2.INTER_LINEAR) >= 0.5, mask, np.uint8(0)), photo.mask, durable=False)
+    in_white = 1 - float(points_of_object(masked, reader).mean())
+    if in_white > MAX_CONTRADICTED:
+        return capture
+    job.say("the subject stands before a white backdrop without a feature, which is left out; --mask off uses the full images", points_in_backdrop=in_white)
+    return replace(capture, photos=masked.photos, provenance=structs.replace(capture.provenance, background="white"))
 
 
 def _white_at_borders(job: Job, capture: Capture, reader: PhotoReader) -> bool:

@@ -49,9 +49,7 @@ class Subject:
 
 
 def subject_of(found: Foreground, points: np.ndarray) -> Subject:
-    """
-    points  (N, 3) where rays of the photographs end
-    """
+    """points  (N, 3) where rays of the photographs end"""
     size = float(np.ptp(found.subject, axis=0).max())
     points = points[np.isfinite(points).all(axis=1)]
     planes = tuple(_support(plane, found, points, LEAST_THICKNESS * size) for plane in found.planes)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.capture.moving_parts import moving_parts
-from efficientnerf.geometry.cameras import Camera, epipolar_error, rays
+from efficientnerf.geometry.cameras import Camera, Similarity, epipolar_error, rays
 from pipeline.files import SafePoint, remove
 from stages.sfm.added.markers import tie_markers
 from stages.sfm.colmap import every_image_read, quiet_pycolmap
@@ -252,10 +252,8 @@ def cameras_of(model: Any) -> dict[int, Camera]:
 
 def camera_of(model: Any, image: Any) -> Camera:
     """At working size, by the name of the photograph's copy."""
-    pose = np.eye(4)
     camera_from_world = np.asarray(image.cam_from_world().matrix())
-    pose[:3, :3] = camera_from_world[:, :3].T
-    pose[:3, 3] = -camera_from_world[:, :3].T @ camera_from_world[:, 3]
+    pose = Similarity(1.0, camera_from_world[:, :3].T, -camera_from_world[:, :3].T @ camera_from_world[:, 3]).matrix()
     lens = model.cameras[image.camera_id]
     return Camera(image.name, lens.width, lens.height, lens.model_name, tuple(float(p) for p in lens.params), pose)
 

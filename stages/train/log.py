@@ -32,9 +32,7 @@ class Log:
     """log.jsonl of a stage. Lines are written by `flush`."""
 
     def __init__(self, path: Path, step: int) -> None:
-        """
-        step  that is gone on from; lines after it are dropped, for they will be logged again
-        """
+        """step  that is gone on from; lines after it are dropped, for they will be logged again"""
         self.path = path
         self.unwritten: list[str] = []
         kept = [line for line in read_lines(path) if line["step"] <= step]

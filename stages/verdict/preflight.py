@@ -121,9 +121,7 @@ def check(folder: Path, settings: Any, threads: int, later: Mapping[str, Any] | 
 
 
 def _small(path: Path, grey: np.ndarray) -> Small:
-    """
-    grey  (H, W) uint8, the photograph as it is meant to be seen
-    """
+    """grey  (H, W) uint8, the photograph as it is meant to be seen"""
     with opened(path) as image:
         size = image.size
         focal = focal_from_exif(dict(exif_of(image).get_ifd(_EXIF)), *size)

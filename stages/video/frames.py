@@ -21,7 +21,7 @@ from efficientnerf.capture.frame_motion import DETAIL, TRACKED, Motion, sharpnes
 from pipeline.files import remove
 from stages.io.png import FAST, write_png
 from stages.scratch import note, noted, once, same_as
-from stages.video.reading import Frame, UnreadableVideo, Video, opened
+from stages.video.reading import UnreadableVideo, opened
 
 SLOWEST = 12.0  # frames a second that are looked at at least; of videos with more than twice as many, every n-th
 NEAREST = 0.25 / SLOWEST  # seconds between frames that are looked at, at least, of videos of an unknown rate
@@ -164,7 +164,9 @@ def _written(name: str, path: Path, place: int, numbers: list[int], max_side: in
         for frame in video.frames():
             reader.safe_point()
             if frame.index in left:
-                _write(frame, targets[frame.index], max_side, video, name)
+                exif = Image.Exif()
+                exif[Base.Make] = video.maker or f"video {name}"  # photographs of one maker and size share a camera
+                write_png(frame.rgb(max_side), targets[frame.index], compress_level=FAST, durable=False, exif=exif)
                 left.remove(frame.index)
                 reader.progress(len(numbers) - len(left), len(numbers), "writing frames")
             if not left:
@@ -173,9 +175,3 @@ def _written(name: str, path: Path, place: int, numbers: list[int], max_side: in
         raise UnreadableVideo(f"{name}: unreadable: {len(left)} frames that were there a moment ago are not. Was the file changed?")
     note(file, numbers, list(targets.values()))
     return targets
-
-
-def _write(frame: Frame, path: Path, max_side: int, video: Video, name: str) -> None:
-    exif = Image.Exif()
-    exif[Base.Make] = video.maker or f"video {name}"  # photographs of one maker and size share a camera
-    write_png(frame.rgb(max_side), path, compress_level=FAST, durable=False, exif=exif)

@@ -26,9 +26,7 @@ class RefinementLog(Log):
     """
 
     def __init__(self, path: Path, step: int, fraction: float, stopwatch: Stopwatch, previews: Previews, clock: Callable[[], float]) -> None:
-        """
-        step, fraction  that the refinement goes on from
-        """
+        """step, fraction  that the refinement goes on from"""
         super().__init__(path, step)
         self.stopwatch, self.previews, self.clock = stopwatch, previews, clock
         self.drawn = int(PREVIEWS * fraction)

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.geometry.cameras import Similarity
 from efficientnerf.rendering.colour import linear_from_srgb
 from efficientnerf.surface.mesh import Mesh
 from efficientnerf.surface.texturing.corners import split_at_seams
@@ -69,8 +70,34 @@ def write_mesh(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP, pic
     check_mesh(mesh, path)
     rotation = gltf_from_capture(frame.up)
     buffer = Buffer()
-    primitive = {**_geometry(mesh, rotation, buffer), "material": 0, "mode": 4}
-    more = _materials(buffer, picture_of(mesh, picture), picture, open_faces(mesh.faces))
+    faces, vertex = mesh.faces, np.arange(len(mesh.vertices))
+    if mesh.texture is not None:
+        corners = split_at_seams(mesh)
+        faces, vertex = corners.faces, corners.vertex
+    positions = np.asarray(mesh.vertices @ rotation.T, "<f4")[vertex]
+    normals = mesh.normals @ rotation.T
+    normals = np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True), "<f4")[vertex]
+    attributes = {
+        "POSITION": buffer.accessor(positions, VERTICES, min=positions.min(0).tolist(), max=positions.max(0).tolist()),
+        "NORMAL": buffer.accessor(normals, VERTICES),
+    }
+    if mesh.texture is not None:
+        attributes["TEXCOORD_0"] = buffer.accessor(np.asarray(corners.coordinates * [1, -1] + [0, 1], "<f4"), VERTICES)
+    else:
+        linear = np.concatenate([linear_from_srgb(np.clip(mesh.colours.astype(np.float64), 0, 1)), np.ones((len(mesh.colours), 1))], 1)
+        attributes["COLOR_0"] = buffer.accessor(np.asarray(np.round(linear * 65535), "<u2"), VERTICES, normalized=True)
+    primitive = {"attributes": attributes, "indices": buffer.accessor(np.asarray(faces, "<u4").reshape(-1), _INDICES), "material": 0, "mode": 4}
+    colours = picture_of(mesh, picture)
+    material: dict[str, Any] = {"name": "captured light", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}}
+    images = [] if colours is None else [{"bufferView": buffer.view(colours), "mimeType": MIME[picture], "name": "colours"}]
+    if images:
+        material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
+    material["extensions"] = {"KHR_materials_unlit": {}}
+    more = {
+        "materials": [material | ({"doubleSided": True} if open_faces(mesh.faces) else {})],
+        **({"textures": [{"source": 0, "sampler": 0}], "images": images,
+            "samplers": [{"magFilter": _LINEAR, "minFilter": _MIPMAPPED, "wrapS": _CLAMPED, "wrapT": _CLAMPED}]} if images else {}),
+    }  # fmt: skip
     write_document("surface", primitive, "KHR_materials_unlit", frame, buffer, path, more)
 
 
@@ -78,8 +105,7 @@ def write_document(
     name: str, primitive: dict[str, Any], extension: str, frame: SourceFrame, buffer: Buffer, path: Path, more: dict[str, Any] | None = None
 ) -> None:
     """Write one node with one primitive, whose data are in the buffer. `more`: of the document, as materials."""
-    rotation, recorded = np.eye(4), frame.world_from_capture
-    rotation[:3, :3] = gltf_from_capture(frame.up)
+    rotation, recorded = Similarity(1.0, gltf_from_capture(frame.up), np.zeros(3)).matrix(), frame.world_from_capture
     source_frame = {
         "gltf_from_capture": (rotation + 0.0).tolist(),  # rows
         "capture_up": (frame.up + 0.0).tolist(),
@@ -100,38 +126,3 @@ def write_document(
     described += b" " * (-len(described) % 4)
     header = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(described) + 8 + buffer.size)
     write_parts(path, [header, struct.pack("<I4s", len(described), b"JSON"), described, struct.pack("<I4s", buffer.size, b"BIN\0"), *buffer.parts])
-
-
-def _geometry(mesh: Mesh, rotation: np.ndarray, buffer: Buffer) -> dict[str, Any]:
-    """Attributes and indices of the primitive, put into the buffer."""
-    faces, vertex = mesh.faces, np.arange(len(mesh.vertices))
-    if mesh.texture is not None:
-        corners = split_at_seams(mesh)
-        faces, vertex = corners.faces, corners.vertex
-    positions = np.asarray(mesh.vertices @ rotation.T, "<f4")[vertex]
-    normals = mesh.normals @ rotation.T
-    normals = np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True), "<f4")[vertex]
-    attributes = {
-        "POSITION": buffer.accessor(positions, VERTICES, min=positions.min(0).tolist(), max=positions.max(0).tolist()),
-        "NORMAL": buffer.accessor(normals, VERTICES),
-    }
-    if mesh.texture is not None:
-        attributes["TEXCOORD_0"] = buffer.accessor(np.asarray(corners.coordinates * [1, -1] + [0, 1], "<f4"), VERTICES)
-    else:
-        linear = np.concatenate([linear_from_srgb(np.clip(mesh.colours.astype(np.float64), 0, 1)), np.ones((len(mesh.colours), 1))], 1)
-        attributes["COLOR_0"] = buffer.accessor(np.asarray(np.round(linear * 65535), "<u2"), VERTICES, normalized=True)
-    return {"attributes": attributes, "indices": buffer.accessor(np.asarray(faces, "<u4").reshape(-1), _INDICES)}
-
-
-def _materials(buffer: Buffer, colours: bytes | None, picture: Picture, both_sides: bool) -> dict[str, Any]:
-    """The material and its texture, which goes into the buffer."""
-    material: dict[str, Any] = {"name": "captured light", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}}
-    images = [] if colours is None else [{"bufferView": buffer.view(colours), "mimeType": MIME[picture], "name": "colours"}]
-    if images:
-        material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
-    material["extensions"] = {"KHR_materials_unlit": {}}
-    return {
-        "materials": [material | ({"doubleSided": True} if both_sides else {})],
-        **({"textures": [{"source": 0, "sampler": 0}], "images": images,
-            "samplers": [{"magFilter": _LINEAR, "minFilter": _MIPMAPPED, "wrapS": _CLAMPED, "wrapT": _CLAMPED}]} if images else {}),
-    }  # fmt: skip

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import Camera, resized, rotated_clockwise
+from efficientnerf.geometry.cameras import Camera, Similarity, resized, rotated_clockwise
 from pipeline.errors import BadInput
 from stages.formats.importers.source import abbreviated
 from stages.io.json_file import LARGEST_NUMBER
@@ -60,10 +60,7 @@ def rotation(columns: np.ndarray, where: str) -> np.ndarray:
 
 def inverse(turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
     """(4, 4) camera to world, of the rotation (3, 3) and the translation (3,) from world to camera."""
-    pose = np.eye(4)
-    pose[:3, :3] = turn.T
-    pose[:3, 3] = -turn.T @ shift
-    return pose
+    return Similarity(1.0, turn.T, -turn.T @ shift).matrix()
 
 
 def image_size(width: float, height: float, where: str, remedy: str) -> tuple[int, int]:

@@ -105,14 +105,10 @@ class Source:
             self._real[path] = target
         return self._real[path]
 
-    def first_of(self, places: Sequence[str]) -> Path | None:
-        """The first of these files that is there; raises BadInput where it leads out of the source."""
-        for place in places:
-            path = self.root / place
-            if path.is_file():
-                self.real(path)
-                return path
-        return None
+    def first_of(self, places: Sequence[str]) -> list[Path]:
+        """The first of these files that is there, or none; raises BadInput where it leads out of the source."""
+        found = next((path for place in places if (path := self.root / place).is_file()), None)
+        return [] if found is None else [self.check_inside(found)]
 
     def check_inside(self, path: Path) -> Path:
         """The path itself, which has passed the gate; BadInput otherwise."""

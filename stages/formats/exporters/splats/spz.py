@@ -48,13 +48,7 @@ _GZIP = b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x02\xff"  # no time, no name, no syst
 def write_splats(gaussians: Gaussians, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP, version: int = 3) -> None:
     """Write Gaussians given in the capture's frame. Raises BadInput."""
     check_gaussians(gaussians, path)
-    bits, parts = _quantised(with_y_up(gaussians, frame), path)
-    write = {3: _as_gzip, 4: _as_zstd}[version]
-    write_parts(path, write(len(gaussians), gaussians.degree, bits, parts))
-
-
-def _quantised(gaussians: Gaussians, path: Path) -> tuple[int, list[bytes]]:
-    """The fractional bits of places, and the parts after the header."""
+    gaussians = with_y_up(gaussians, frame)
     reach = float(np.abs(gaussians.means).max())
     if reach > LARGEST:
         raise BadInput(f"{path}: Gaussians at up to {reach:g} units; SPZ has places up to {LARGEST}. Write .ply or .glb.")
@@ -64,7 +58,7 @@ def _quantised(gaussians: Gaussians, path: Path) -> tuple[int, list[bytes]]:
     places = np.round(gaussians.means.astype(np.float64) * 2**bits).astype("<i4")
     above = gaussians.harmonics[:, 1:].astype(np.float64)
     codes = (np.round(above * 128).astype(np.int64) + 128 + BUCKET // 2) // BUCKET * BUCKET
-    return bits, [
+    parts = [
         places.view(np.uint8).reshape(count, 3, 4)[:, :, :3].tobytes(),
         _bytes(gaussians.opacities * 255.0),
         _bytes(gaussians.harmonics[:, 0] * (COLOUR * 255) + 127.5),
@@ -72,6 +66,7 @@ def _quantised(gaussians: Gaussians, path: Path) -> tuple[int, list[bytes]]:
         rotation_codes(gaussians.rotations).tobytes(),
         np.clip(codes, 0, 255).astype(np.uint8).tobytes(),
     ]
+    write_parts(path, {3: _as_gzip, 4: _as_zstd}[version](count, gaussians.degree, bits, parts))
 
 
 def places(raw: bytes, bits: int) -> np.ndarray:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import Camera
+from efficientnerf.geometry.cameras import Camera, Similarity
 from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.formats.importers import lenses
@@ -44,12 +44,6 @@ def pinhole_frame(k: np.ndarray, pose: np.ndarray, where: str, stated: tuple[int
     return lambda name, size: _pinhole(name, stated or size, k, pose, where)
 
 
-def from_world(matrix: np.ndarray, where: str) -> np.ndarray:
-    """(4, 4) world to camera -> camera to world. Raises BadInput where it is no rigid motion."""
-    rigid = lenses.rigid(matrix, where)
-    return lenses.inverse(rigid[:3, :3], rigid[:3, 3])
-
-
 def decomposed(projection: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     """(3, 4) K [R t] -> K (3, 3) with a positive diagonal and 1 at its end, and the pose (4, 4), camera to world. Raises BadInput."""
     left = projection[:, :3]
@@ -61,10 +55,7 @@ def decomposed(projection: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarr
     k, turn = r.T[::-1, ::-1], q.T[::-1]
     signs = np.sign(np.diag(k))
     k, turn = k * signs, turn * signs[:, None]
-    pose = np.eye(4)
-    pose[:3, :3] = lenses.rotation(turn, where).T
-    pose[:3, 3] = -np.linalg.solve(left, projection[:, 3])
-    return k / k[2, 2], pose
+    return k / k[2, 2], Similarity(1.0, lenses.rotation(turn, where).T, -np.linalg.solve(left, projection[:, 3])).matrix()
 
 
 def intrinsics_of(path: Path) -> tuple[np.ndarray, tuple[int, int] | None]:

@@ -25,7 +25,7 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.formats.importers import frames, lenses
 from stages.formats.importers.colmap_model import FISHEYE, as_traced, count_parameters
-from stages.formats.importers.datasets.matrices import MAX_CAMERA_BYTES, REMEDY, archive_matrices, decomposed, from_world, intrinsics_of, pinhole_frame
+from stages.formats.importers.datasets.matrices import MAX_CAMERA_BYTES, REMEDY, archive_matrices, decomposed, intrinsics_of, pinhole_frame
 from stages.formats.importers.frames import Frame
 from stages.formats.importers.listed import Z_UP, Listed, ListFormat, places_of, sparse_points
 from stages.formats.importers.source import MAX_FRAMES, Source, images_in
@@ -235,7 +235,8 @@ def _mvsnet(source: Source, signs: Sequence[Path]) -> Listed:
         found = read_text(source.real(path), MAX_CAMERA_BYTES).split()
         if len(found) < 27 or found[0] != "extrinsic" or found[17] != "intrinsic":
             raise BadInput(f"{where}: expected `extrinsic` with 16 numbers and `intrinsic` with 9. {REMEDY}")
-        pose = from_world(numbers(found[1:17], 16, f"{where}: extrinsic").reshape(4, 4), f"{where}: extrinsic")
+        rigid = lenses.rigid(numbers(found[1:17], 16, f"{where}: extrinsic").reshape(4, 4), f"{where}: extrinsic")
+        pose = lenses.inverse(rigid[:3, :3], rigid[:3, 3])
         camera = pinhole_frame(numbers(found[18:27], 9, f"{where}: intrinsic").reshape(3, 3), pose, where)
         if scans:
             listed.append(Frame(f"rect_{int(stem) + 1:03d}_{DTU_LIGHT}_r5000.png", scans[0], where, camera))
@@ -247,9 +248,7 @@ def _mvsnet(source: Source, signs: Sequence[Path]) -> Listed:
 
 
 # IDR
-def _idr_files(source: Source) -> Sequence[Path]:
-    found = source.first_of(("cameras_sphere.npz", "cameras.npz", "cameras_large.npz", "cameras_linear_init.npz"))
-    return [] if found is None else [found]
+IDR_CAMERAS = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz", "cameras_linear_init.npz")
 
 
 def _idr(source: Source, signs: Sequence[Path]) -> Listed:
@@ -353,6 +352,6 @@ def _tanks(source: Source, signs: Sequence[Path]) -> Listed:
 SCANNETPP = ListFormat("scannetpp", f"{' or '.join(SCANNETPP_LISTS)}, here or in dslr/", _scannetpp_files, _scannetpp)
 KAPTURE = ListFormat("kapture", f"{SENSORS} and {RECORDS}", _kapture_files, _kapture, _is_kapture)
 MVSNET = ListFormat("mvsnet", "cams/00000000_cam.txt and so on", _mvsnet_files, _mvsnet)
-IDR = ListFormat("idr", "cameras_sphere.npz or cameras.npz", _idr_files, _idr)
+IDR = ListFormat("idr", "cameras_sphere.npz or cameras.npz", lambda source: source.first_of(IDR_CAMERAS), _idr)
 NSVF = ListFormat("nsvf", "intrinsics.txt and pose/<name>.txt", _nsvf_files, _nsvf)
 TANKS = ListFormat("tanks-and-temples", "one trajectory (.log) next to the folder of images", _tanks_files, _tanks, single=True)

@@ -36,11 +36,6 @@ _BROWN = {
 _FISHEYE = {"fisheye": ("k1", "k2"), "fisheye_opencv": ("k1", "k2", "k3", "k4")}
 
 
-def _signs(source: Source) -> Sequence[Path]:
-    file = source.first_of(PLACES)
-    return [] if file is None else [file]
-
-
 def _listed(source: Source, signs: Sequence[Path]) -> Listed:
     """The reconstruction with most shots."""
     file, where, tracks = signs[0], source.name_of(signs[0]), signs[0].with_name("tracks.csv")
@@ -146,4 +141,4 @@ def _tracks(source: Source, file: Path, points: dict[str, int], places: dict[str
     return [tuple(sorted(track)) for track in tracks]
 
 
-FORMAT = ListFormat("opensfm", " or ".join(PLACES), _signs, _listed)
+FORMAT = ListFormat("opensfm", " or ".join(PLACES), lambda source: source.first_of(PLACES), _listed)

@@ -18,7 +18,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import Camera, pose_from_opengl
+from efficientnerf.geometry.cameras import Camera, Similarity, pose_from_opengl
 from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.formats.importers import frames, lenses
@@ -99,9 +99,8 @@ def _row(source: Source, where: str, cells: dict[str, str]) -> frames.Frame:
 
     where = f"{where} ({printable(cells['name'], frames.MAX_NAME)})"
     heading, pitch, roll = np.radians([value("heading"), value("pitch"), value("roll")])
-    pose = np.eye(4)
-    pose[:3, :3] = _about("z", -heading) @ _about("x", pitch) @ _about("y", roll)
-    pose[:3, 3] = value("x"), value("y"), value("alt")
+    turn = _about("z", -heading) @ _about("x", pitch) @ _about("y", roll)
+    pose = Similarity(1.0, turn, np.array([value("x"), value("y"), value("alt")])).matrix()
     radial, tangential = (value("k1"), value("k2"), value("k3"), value("k4")), (value("t2"), value("t1"))
     lens = _lens(value("f"), (value("px"), value("py")), radial, tangential, pose_from_opengl(pose), where)
     return frames.Frame(cells["name"], source.root, where, lens, bare=True)
@@ -176,9 +175,7 @@ def _sidecar(stated: Callable[[str], str | None], where: str) -> frames.CameraOf
 
     turn = numbers((stated("Rotation") or "").split(), 9, f"{where}: Rotation").reshape(3, 3)
     place = numbers((stated("Position") or "").split(), 3, f"{where}: Position")
-    pose = np.eye(4)
-    pose[:3, :3] = lenses.rotation(turn, f"{where}: Rotation").T
-    pose[:3, 3] = place
+    pose = Similarity(1.0, lenses.rotation(turn, f"{where}: Rotation").T, place).matrix()
     model = (stated("DistortionModel") or "none").lower()
     words = (stated("DistortionCoeficients") or "").split()  # so spelled
     k = [number(word, f"{where}: DistortionCoeficients") for word in words[:6]]
