@@ -1,7 +1,7 @@
 """Cameras of photographs that state none: found by what masks keep, or by all that the photographs show, whichever the camera moved past."""
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from stages.formats.importers import IMPORTERS, posed_format
 from stages.framing.gps import with_gps, with_stated_cameras
 from stages.framing.markers import find_markers
 from stages.framing.mask_use import MIN_AGREEING, share_that_fits
-from stages.io.capture import FOREGROUND, Capture, Provenance, Silhouettes
+from stages.io.capture import FOREGROUND, Capture, Markers, Provenance, Silhouettes
 from stages.io.material import photographs_of
 from stages.io.pictures import UnreadableImage, read_header
 from stages.io.reader import PhotoReader
@@ -46,30 +46,7 @@ def cameras_of_photographs(job: Job, reader: PhotoReader, warn: Any) -> Capture:
         with contextlib.suppress(UnreadableImage):  # reported where it is read
             sizes[name] = read_header(path).size
     markers = None if settings.marker_size == "off" else find_markers(job, {name: (paths[name], size) for name, size in sizes.items()})
-    source = job.source
-    assert source is not None
-    networks = given_networks(settings.features_model, settings.matcher_model)
-    features = resolved(settings.max_features) or features_for(len(paths))
-
-    def find(name: str, masks: Mapping[str, Path | None]) -> Capture:
-        """Structure from motion, with a scratch folder of its own for each name."""
-        request = Request(
-            source,
-            dict(paths),
-            job.work / name,
-            max_side=settings.feature_image_size,
-            features=features,
-            matching=settings.matching,
-            seed=settings.seed,
-            threads=feature_threads(job, [*sizes.values()], settings.feature_image_size, features, count_cores(), networks=networks is not None),
-            masks=dict(masks),
-            lens="perspective" if settings.lens == "equirectangular" else settings.lens,
-            networks=networks,
-            copies=reader.folder,
-            markers=markers or {},
-        )
-        return find_cameras(request, progress=job.progress, safe_point=job.safe_point, warn=warn)
-
+    find = _search(job, paths, reader, warn, [*sizes.values()], markers)
     given, inverted = kept_white(job, paths, found.masks, reader)
     masks = {**given, **masks_made_for(job, {name: path for name, path in paths.items() if name not in found.masks}, warn)}
     guessed = not masks and settings.mask_from == "auto" and settings.masks != "ignore"
@@ -151,6 +128,34 @@ def mask_choice(settings: Any, provenance: Provenance) -> str:
     """The meaning of masks: those made of a background, or by a network, are silhouettes."""
     made = settings.mask_from not in ("auto", "off") or settings.mask_model != "off" or provenance.background in ("left out", "white")
     return "silhouette" if made and settings.masks == "auto" else str(settings.masks)
+
+
+def _search(job: Job, paths: Mapping[str, Path], reader: PhotoReader, warn: Any, sizes: Sequence[tuple[int, int]], markers: Markers | None) -> Find:
+    """Structure from motion on photographs, with a scratch folder of its own for each name."""
+    source, settings = job.source, job.settings
+    assert source is not None
+    networks = given_networks(settings.features_model, settings.matcher_model)
+    features = resolved(settings.max_features) or features_for(len(paths))
+
+    def find(name: str, masks: Mapping[str, Path | None]) -> Capture:
+        request = Request(
+            source,
+            dict(paths),
+            job.work / name,
+            max_side=settings.feature_image_size,
+            features=features,
+            matching=settings.matching,
+            seed=settings.seed,
+            threads=feature_threads(job, sizes, settings.feature_image_size, features, count_cores(), networks=networks is not None),
+            masks=dict(masks),
+            lens="perspective" if settings.lens == "equirectangular" else settings.lens,
+            networks=networks,
+            copies=reader.folder,
+            markers=markers or {},
+        )
+        return find_cameras(request, progress=job.progress, safe_point=job.safe_point, warn=warn)
+
+    return find
 
 
 def _of_turning_subject(job: Job, find: Find, paths: Mapping[str, Path], reader: PhotoReader) -> tuple[Capture | None, bool]:
