@@ -11,18 +11,20 @@ A child that comes to no safe point, as within one bundle adjustment, is killed 
 """
 
 import builtins
+import contextlib
 import json
 import os
-import select
+import queue
 import signal
 import subprocess
-import time
+import threading
 from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
 from pipeline import errors
 from pipeline.errors import StageFailed
 from pipeline.executors.pipes import Child
+from pipeline.executors.side_by_side import FailureInChild
 from pipeline.text import printable
 
 _HANDLED = (signal.SIGINT, signal.SIGTERM)
@@ -34,10 +36,6 @@ _FRAMES = (" ", "\t", "*** ", "PC: @", "Current thread", "Thread 0x", "Stack (mo
 
 class ChildAborted(StageFailed):
     """The process ended without an answer; the text has its last words."""
-
-
-class _ChildTraceback(Exception):
-    """The child's traceback, as the cause of its error."""
 
 
 def run(
@@ -87,45 +85,33 @@ class _Child(Child):
             super().__init__("stages.sfm.child")
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, former)
-        self._said, self._looked = bytearray(), 0  # _looked: bytes of _said without a line end
+        self._messages: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
+        threading.Thread(target=self._hear, name="messages of structure from motion", daemon=True).start()
         self.write({"parent": os.getpid(), "task": task, "arguments": arguments})
+
+    def _hear(self) -> None:
+        """Queue its messages; None once it has ended, with half a line or none."""
+        assert self.process.stdout is not None
+        with contextlib.suppress(OSError, ValueError):
+            for line in self.process.stdout:
+                if not line.endswith(b"\n") or not isinstance(message := json.loads(line), dict):
+                    break
+                self._messages.put(message)
+        self._messages.put(None)
 
     def receive(self, idle: Callable[[], None]) -> dict[str, Any] | None:
         """The next message; None once the child has ended. `idle` is called again and again until then."""
-        while (end := self._said.find(b"\n", self._looked)) < 0:
-            self._looked = len(self._said)
-            while not self._is_readable(POLL_SECONDS):
+        while True:
+            try:
+                return self._messages.get(timeout=POLL_SECONDS)
+            except queue.Empty:
                 idle()
-            if not (some := self._read()):
-                return None  # with half a line, or none
-            self._said += some
-        line = bytes(self._said[:end])
-        del self._said[: end + 1]
-        self._looked = 0
-        try:
-            message = json.loads(line)
-        except ValueError:
-            return None
-        return message if isinstance(message, dict) else None
-
-    def _is_readable(self, seconds: float) -> bool:
-        assert self.process.stdout is not None
-        looks = select.poll()  # select() knows no descriptors from 1024 on
-        looks.register(self.process.stdout.fileno(), select.POLLIN)
-        return bool(looks.poll(1000 * seconds))
-
-    def _read(self) -> bytes:
-        assert self.process.stdout is not None
-        return os.read(self.process.stdout.fileno(), 65536)
 
     def stop(self) -> None:
         """Let the child end at its next safe point, or kill it; at once where this is interrupted."""
-        until = time.monotonic() + GRACE
         try:
             self.write("stop")
-            while (left := until - time.monotonic()) > 0 and (not self._is_readable(left) or self._read()):
-                pass
-            self.process.wait(max(0.0, until - time.monotonic()))
+            self.process.wait(GRACE)
         except subprocess.TimeoutExpired:
             self.process.kill()
         except BaseException:
@@ -146,7 +132,7 @@ class _Child(Child):
 def _raise(message: Mapping[str, Any]) -> NoReturn:
     """The child's error again: ours and Python's own by their class, any other as a RuntimeError that names it."""
     name, text, number = str(message["type"]), str(message["text"]), message["errno"]
-    cause = _ChildTraceback(f"\n{message['traceback']}")
+    cause = FailureInChild(f"\n{message['traceback']}")
     if number is not None:
         raise OSError(number, message["strerror"], message["filename"]) from cause
     found = getattr(errors, name, None) or getattr(builtins, name, None)
