@@ -14,6 +14,7 @@ on a constant background they are over the pixels that the photograph's alpha co
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,10 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.asset import format
+from efficientnerf.asset.rendering import Rendering
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.capture.captured_path import captured_cameras
+from efficientnerf.geometry.cameras import Camera
 from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.settings import resolved
 from pipeline.files import write_json
@@ -38,13 +42,13 @@ from stages.evaluate.sparse_points import observed_points
 from stages.evaluate.splats import EvaluatedSplats, load_splats
 from stages.evaluate.strips import strip_views, write_strips
 from stages.evaluate.summary import in_words, quality, summary
-from stages.evaluate.video import write_captured_path
-from stages.evaluate.views import bounded_stride, evaluation_views, evenly_spaced, stride_for
+from stages.evaluate.views import bounded_stride, constant_background, evaluation_views, evenly_spaced, stride_for
+from stages.figures.frames import RenderOptions, encode_frames, render_frames
 from stages.figures.plots import contact_sheet, thumbnail_of
 from stages.io.field_file import load_renderer
-from stages.io.png import read_png, write_png
+from stages.io.png import FAST, read_png, write_png
 from stages.io.refined_cameras import load_scene
-from stages.io.scene import View
+from stages.io.scene import Scene, View
 from stages.memory.need import refuse_what_does_not_fit
 from stages.reports import RegionReport, read_report
 from stages.scratch import note, noted, once
@@ -52,6 +56,7 @@ from stages.train.averaged import as_taken
 
 SHEET_ROWS = 8
 THUMBNAIL = 320  # pixels, longest side
+VIDEO_LONGEST, VIDEO_FPS, VIDEO_CRF = 480, 15, 20  # of the captured path; pixels, the longer side
 Measured = str | float | dict[str, int | float | list[float] | None] | None  # the name of a view, or its metrics
 
 
@@ -112,7 +117,7 @@ def evaluate(
     _write_sheet(metrics, drawn, job)
     frames = resolved(settings.captured_path_frames)
     if frames is not None:
-        write_captured_path(asset, tree, scene, frames, job)
+        _write_captured_path(asset, tree, scene, frames, job)
     job.say(in_words(metrics))
     judge(e, views, metrics)
 
@@ -156,3 +161,24 @@ def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> Non
         labels.append([view["name"], f"field {quality(view['network'])}", "error of the field", f"asset {quality(view['asset'])}", "error of the asset"])
     title = f"{metrics['split']} views: field {quality(metrics['network'])}; asset {quality(metrics['asset'])}; errors are white from 0.25"
     contact_sheet(rows, labels, EvaluateOutputs(job.out).contact_sheet, thumbnail=THUMBNAIL, title=title)
+
+
+def _write_captured_path(asset: EvaluatedAsset, tree: NerfTree, scene: Scene, frames: int, job: Job) -> None:
+    """Write the video of the asset alone, as seen along the photographs' cameras. Frames are kept in job.work, so that a kill costs at most the last few.
+
+    tree  the asset's, whose metadata frames need
+    """
+    behind = constant_background(scene)
+
+    def draw(tree: NerfTree, camera: Camera, **more: Any) -> Rendering:
+        rendering: Rendering = asset.render(camera, background=behind, **more)
+        return replace(rendering, opacity=np.ones_like(rendering.opacity))  # whatever is behind has been drawn
+
+    def each(done: int, total: int) -> None:
+        job.safe_point()
+        job.progress(done, total, "frames of the captured path")
+
+    cameras = captured_cameras([view.camera for view in scene.views], frames, VIDEO_LONGEST)
+    options = RenderOptions(exr="off", fps=VIDEO_FPS, crf=VIDEO_CRF, compress_level=FAST)
+    written = render_frames(tree, cameras, job.work / "captured", options, each, reuse=True, draw=draw, warn=job.warn)
+    encode_frames(written, EvaluateOutputs(job.out).captured_path, options, job.safe_point)
