@@ -24,6 +24,7 @@ from efficientnerf.training.settings import TrainSettings
 SKY_DEGREE = 2
 SKY_LEAST = 0.01  # of a channel that the sky begins with, and of what is left to 1: from 0 or 1 nothing would ever change it
 SAMPLES_AT_ONCE = 2**19  # that are rendered where nothing is pruned
+HIDDEN = 1e-4  # of a ray's light: where no more is left, samples are left out of training
 UNSEEN = 0.5  # grey: drawn behind a space that reaches to infinity, where nothing can lie
 
 
@@ -227,9 +228,17 @@ def render_rays(
     coarse = stage.samples
     coarse_raw, coarse_out = _composited(m, m.coarse, directions, coarse, behind)
     pivotal, fine = m.strategy.fine(request, stage, coarse_out.weight.detach())
+    if prune and rng is not None and capacity is None and isinstance(m.strategy, Efficient):  # on a device the number of samples is not known
+        fine = _visible(m, fine)
     fine_raw, out = _composited(m, m.fine, directions, fine, behind)
     out = out._replace(distortion=out.distortion + coarse_out.distortion)
     return RayOutputs(rays, coarse, coarse_raw, coarse_out.weight, coarse_out.colour, pivotal, fine, fine_raw, *out)
+
+
+@torch.no_grad()
+def _visible(m: Model, fine: Samples) -> Samples:
+    """The fine samples that are not behind what the fine field has: two in three are, for the coarse field is less sharp, and nothing is learned from them."""
+    return dispatch.visible_samples(fine, m.fine.density(m.snapped_points(fine.point)), m.fine.activation, HIDDEN)
 
 
 def _composited(m: Model, field: Field, directions: Tensor, samples: Samples, behind: Tensor) -> tuple[Tensor, Composite]:

@@ -35,6 +35,7 @@ OPERATIONS: dict[str, dict[Backend, str]] = {
     "valid_samples": {"torch": "sampling.valid", "numba": "backends.numba.operations", "triton": "backends.triton.sampling"},
     "select_pivots": {"torch": "sampling.pivotal", "numba": "backends.numba.operations", "triton": "backends.triton.sampling"},
     "pivotal_samples": {"torch": "sampling.pivotal", "numba": "backends.numba.operations", "triton": "backends.triton.sampling"},
+    "visible_samples": {"torch": "sampling.visible", "numba": "backends.numba.operations"},
     "composite": {"torch": "rendering.compositing", "numba": "backends.numba.operations", "triton": "backends.triton.compositing"},
     "scaled_by_distance": {"torch": "rendering.compositing", "numba": "backends.numba.operations"},
     "basis": {"torch": "rendering.harmonics", "numba": "backends.numba.operations"},
@@ -148,6 +149,11 @@ def pivotal_samples(
     backend = backend_of(origins, directions, offset, coarse.start)
     divide = implementation("pivotal_samples", backend)
     return divide(space, origins, directions, offset, coarse, pivotal, per_pivot, **_capacity(backend, capacity))
+
+
+def visible_samples(samples: Samples, raw: Tensor, activation: str, least: float) -> Samples:
+    """See `efficientnerf.sampling.visible.visible_samples`."""
+    return implementation("visible_samples", backend_of(raw))(samples, raw, activation, least)
 
 
 def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, activation: str) -> Composite:

@@ -152,7 +152,7 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
             plan = StepPlan(prune, samples_per_pivot, capacity, is_learned(fraction))
             if readback is None:
                 fine_loss, outputs = step_on_rays(learner, plan, sent(inputs, m.device), numbers, rng)
-                counts, empty = _counted(t, rays, fine_loss, outputs), len(outputs.coarse.start) == 0
+                counts, empty = _counted(t, rays, fine_loss, outputs, samples_per_pivot), len(outputs.coarse.start) == 0
                 del outputs
             else:
                 counts, empty = _not_waited_for(learner, graphs, readback, plan, inputs, numbers, rng), None
@@ -162,11 +162,13 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
         yield Progress(t.step, counts.loss, rays, *counts[1:])
 
 
-def _counted(t: Trainer, rays: int, fine_loss: Tensor, outputs: RayOutputs) -> StepCounts:
+def _counted(t: Trainer, rays: int, fine_loss: Tensor, outputs: RayOutputs, samples_per_pivot: int) -> StepCounts:
     """The step's statistics; updates the running average of samples."""
     coarse, fine = outputs.coarse, outputs.fine
     counts = StepCounts(float(fine_loss), coarse.tried, len(coarse.start), int(outputs.pivotal.sum()), len(fine.start))
-    t.samples_per_ray = 0.9 * t.samples_per_ray + 0.1 * max((counts.fine + counts.valid) / rays, 1.0)
+    # With the fine samples that are left out because they are hidden: a step has as many rays as on a device, where none are.
+    drawn = samples_per_pivot * counts.pivotal if isinstance(t.model.strategy, Efficient) else counts.fine
+    t.samples_per_ray = 0.9 * t.samples_per_ray + 0.1 * max((drawn + counts.valid) / rays, 1.0)
     return counts
 
 

@@ -8,24 +8,25 @@ import torch
 from torch import Tensor
 
 from efficientnerf.fields.field import BakeableField
-from efficientnerf.model import Model, render_rays, restore, state_of
+from efficientnerf.model import HIDDEN, Model, render_rays, restore, state_of
 from tests.efficientnerf.balls import pixels, untrained
 
 
 class Counting(BakeableField):
-    """A field that remembers where it was queried: a ball of density e^6 round the grid's centre, e^-6 elsewhere."""
+    """A field that remembers where it was queried: a ball of density e^inside round the grid's centre, e^-6 elsewhere."""
 
     activation = "exp"
     degree = 0
 
-    def __init__(self) -> None:
+    def __init__(self, inside: float = 6.0) -> None:
         super().__init__()
+        self.inside = inside
         self.snapped_points: list[Tensor] = []
 
     def forward(self, points: Tensor) -> Tensor:
         self.snapped_points.append(points)
         inside = (points - 0.5).norm(dim=1) < 0.25
-        return torch.cat([torch.where(inside, 6.0, -6.0)[:, None], torch.zeros(len(points), 3)], dim=1)
+        return torch.cat([torch.where(inside, self.inside, -6.0)[:, None], torch.zeros(len(points), 3)], dim=1)
 
 
 def bundle(count: int = 64) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -65,16 +66,32 @@ def test_training_explores_intervals_without_a_pivot_and_rendering_does_not() ->
     rays = bundle()
     behind = torch.ones(len(rays[0]), 3)
     with torch.no_grad():
-        m.coarse, m.fine = Counting(), Counting()
+        m.coarse, m.fine = Counting(1.0), Counting()
         drawn = render_rays(m, *rays, behind)
+        m.fine.snapped_points.clear()
         one, same = (render_rays(m, *rays, behind, rng=np.random.default_rng(3)) for _ in range(2))
         none = render_rays(untrained(exploration_fraction=0.0), *rays, behind, rng=np.random.default_rng(3))
     assert torch.equal(one.pivotal, same.pivotal)
     assert (one.pivotal | ~drawn.pivotal).all()  # pivots stay pivots
     share = float((one.pivotal & ~drawn.pivotal).sum()) / float((~drawn.pivotal).sum())
     assert 0.4 < share < 0.6
-    assert len(one.fine.start) == m.settings.samples_per_pivot * int(one.pivotal.sum())
+    every, visible = m.fine.snapped_points[:2]
+    assert len(every) == m.settings.samples_per_pivot * int(one.pivotal.sum())
+    assert len(visible) == len(one.fine.start) < len(every)
     assert int(none.pivotal.sum()) <= int((none.coarse_weight > m.settings.pivotal_threshold).sum())
+
+
+def test_what_training_leaves_out_is_not_seen() -> None:
+    m = untrained(exploration_fraction=0.0, occupancy_update_ray_fraction=0.0)
+    m.coarse, m.fine = Counting(1.0), Counting()
+    with torch.no_grad():
+        rendered, trained = (render_rays(m, *bundle(), torch.ones(64, 3), rng=rng) for rng in (None, np.random.default_rng(0)))
+    weights = rendered.fine_weight.double().split(rendered.fine.first.diff().tolist())
+    left = [1 - (torch.cumsum(each, 0) - each) for each in weights]
+    assert [int((each > HIDDEN).sum()) for each in left] == trained.fine.first.diff().tolist()
+    assert len(trained.fine.start) < len(rendered.fine.start)
+    torch.testing.assert_close(trained.fine_colour, rendered.fine_colour, rtol=0, atol=1.01 * HIDDEN)
+    torch.testing.assert_close(trained.fine_opacity, rendered.fine_opacity, rtol=0, atol=1.01 * HIDDEN)
 
 
 def test_states_are_restored_and_what_does_not_fit_is_named() -> None:

@@ -52,6 +52,12 @@ def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: T
     return Samples._make([*(torch.from_numpy(a) for a in fine), coarse.tried, None])
 
 
+def visible_samples(samples: Samples, raw: Tensor, activation: str, least: float) -> Samples:
+    columns = SampleColumns(*map(_array, samples[1:5]))
+    found = sampling.visible_samples(_array(samples.first), columns, _array(raw), activation == "exp", least)
+    return Samples._make([*(torch.from_numpy(a) for a in found), samples.tried, None])
+
+
 def update_occupancy_maximum(values: Tensor, point: Tensor, raw: Tensor, activation: str, cell: Tensor | None = None) -> None:
     if cell is None:
         cell = torch.empty(len(point), dtype=torch.int32)

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from efficientnerf.backends.layout import RayBundle, SampleColumns
+from efficientnerf.backends.numba.compositing import activate_density
 from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.vector.maths import absolute, bits_of, broadcast, lowest_bit, maximum, minimum, select, to_int32
 from efficientnerf.backends.numba.vector.memory import gather, load, pointer, store
@@ -241,3 +242,40 @@ def pivotal_samples(bundle: RayBundle, box: Box, first: np.ndarray, coarse: Samp
     fine_start, fine_extent, fine_length, point = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32), np.empty((n, 3), np.float32)
     _write_pivotal(bundle, box, first, coarse, pivotal, per_pivot, fine_first, fine_start, fine_extent, fine_length, point)
     return fine_first, fine_start, fine_extent, fine_length, point
+
+
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
+def _count_visible(raw, length, first, exponential, deepest, counts):
+    """Writes how many samples of each ray lie before the optical depth `deepest`."""
+    rays = len(counts)
+    for block in numba.prange((rays + BLOCK - 1) // BLOCK):
+        for r in range(block * BLOCK, min(rays, (block + 1) * BLOCK)):
+            n, depth = first[r], np.float32(0)
+            while n < first[r + 1] and depth < deepest:
+                depth += activate_density(raw[n], exponential)[0] * length[n]
+                n += 1
+            counts[r] = n - first[r]
+
+
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
+def _write_first(first, columns, kept, start, extent, length, point):
+    """The first samples of each ray, as many as `kept` (R + 1,) says, end to end."""
+    old_start, old_extent, old_length, old_point = columns
+    rays = len(kept) - 1
+    for block in numba.prange((rays + BLOCK - 1) // BLOCK):
+        for r in range(block * BLOCK, min(rays, (block + 1) * BLOCK)):
+            back = first[r] - kept[r]
+            for n in range(kept[r], kept[r + 1]):
+                start[n], extent[n], length[n] = old_start[back + n], old_extent[back + n], old_length[back + n]
+                point[n, 0], point[n, 1], point[n, 2] = old_point[back + n, 0], old_point[back + n, 1], old_point[back + n, 2]
+
+
+def visible_samples(first: np.ndarray, columns: SampleColumns, raw: np.ndarray, exponential: bool, least: float) -> tuple[np.ndarray, ...]:
+    """`efficientnerf.sampling.visible.visible_samples` on arrays: (first, start, extent, length, point)."""
+    counts = np.empty(len(first) - 1, np.int64)
+    _count_visible(raw, columns.length, first, exponential, np.float32(-np.log(least)), counts)
+    kept = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
+    n = int(kept[-1])
+    out = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32), np.empty((n, 3), np.float32)
+    _write_first(first, columns, kept, *out)
+    return kept, *out

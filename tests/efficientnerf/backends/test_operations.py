@@ -111,6 +111,30 @@ def buffer_for(table: Tensor) -> GradientBuffer:
     return BUFFERS[table.data_ptr()]
 
 
+def visible_samples_case(activation: str) -> Case:
+    """Rays of no sample, of one, and of some that are hidden and none that is."""
+    counts, least = [0, 1, 9, 40, 0, 6], 1e-2
+    draw = np.random.default_rng(7)
+    columns = {name: torch.from_numpy(draw.random(size).astype(np.float32)) for name, size in (("start", 56), ("extent", 56), ("point", (56, 3)))}
+    inputs = {"length": torch.from_numpy(draw.uniform(0.1, 0.3, 56).astype(np.float32)), "raw": torch.from_numpy(draw.normal(size=56).astype(np.float32))}
+
+    def call(visible_samples: Operation, first: Tensor, raw: Tensor, **columns: Tensor) -> list[Tensor]:
+        return list(visible_samples(Samples(first=first, **columns, tried=0), raw, activation, least)[:5])  # type: ignore[arg-type]
+
+    def loop(first: np.ndarray, raw: np.ndarray, **columns: np.ndarray) -> list[np.ndarray]:
+        kept, ends = [], [0]
+        for begin, end in itertools.pairwise(first):
+            left = 1.0
+            for n in range(begin, end):
+                if left > least:
+                    kept.append(n)
+                left *= math.exp(-reference.activate(raw[n], activation) * columns["length"][n])
+            ends.append(len(kept))
+        return [np.array(ends), *(columns[name][kept] for name in ("start", "extent", "length", "point"))]
+
+    return Case(call, loop, {"first": torch.tensor([0, *np.cumsum(counts)]), **inputs, **columns})
+
+
 def composite_case(activation: str, degree: int) -> Case:
     """Rays of no sample, of one, and of some more than a chunk; one begins with an opaque sample."""
     b = in_float32(bundle(degree, (5, 1, 0, 33, 9, 3)))
@@ -435,6 +459,7 @@ CASES: dict[str, dict[str, Callable[[], Case]]] = {
     },
     "select_pivots": {f"{most}": lambda most=most: select_pivots_case(most) for most in (1, 4, 100)},  # type: ignore[misc]
     "pivotal_samples": {f"{'contracted' if c else 'box'}": lambda c=c: pivotal_samples_case(c, 3) for c in (False, True)},  # type: ignore[misc]
+    "visible_samples": {a: lambda a=a: visible_samples_case(a) for a in ("exp", "softplus")},  # type: ignore[misc]
     "composite": {f"{a}-{d}": lambda a=a, d=d: composite_case(a, d) for a, d in (("exp", 0), ("softplus", 1), ("exp", 2))},  # type: ignore[misc]
     "scaled_by_distance": {"": scaled_by_distance_case},
     "basis": {f"{degree}": lambda degree=degree: basis_case(degree) for degree in range(5)},  # type: ignore[misc]

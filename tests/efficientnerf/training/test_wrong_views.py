@@ -70,8 +70,8 @@ def train(t: Trainer, pixels: Pixels) -> None:
 
 
 def untrained(cameras: list[Camera]) -> Trainer:
-    """Of 3000 steps."""
-    return trainer(balls.untrained(iterations=3000, num_levels=6, sample_batch_size=12288, finest_resolution=64), cameras=cameras)
+    """Of 3000 steps. On 32 voxels a side, as many as pictures have pixels: a search finds poses in smooth fields."""
+    return trainer(balls.untrained(iterations=3000, num_levels=6, sample_batch_size=12288, finest_resolution=32), cameras=cameras)
 
 
 @pytest.fixture(scope="module")
