@@ -48,7 +48,7 @@ OPERATIONS: dict[str, dict[Backend, str]] = {
     "pixel_rays": {"torch": "backends.torch.rays", "numba": "backends.numba.operations"},
     "tree_rays": {"numba": "backends.numba.operations", "triton": "backends.triton.tree"},
 }
-# The module whose `optimise`, `total_loss` and `max_weights` fit trees to photographs; see `efficientnerf.asset.refinement.fit`.
+# The module whose `Steps`, `losses_of` and `max_weights` fit trees to photographs; see `efficientnerf.asset.refinement.fit`.
 FITTING: dict[Backend, str] = {"numba": "asset.refinement.host", "triton": "asset.refinement.device"}
 # The module whose `splat_image` renders 3D Gaussians, and whose `SplatFit` fits them to pictures.
 SPLATS: dict[Backend, str] = {"numba": "backends.numba.splats.fit", "triton": "backends.triton.splats.fit"}

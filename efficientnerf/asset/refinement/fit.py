@@ -15,12 +15,16 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from efficientnerf.asset.refinement.error_map import INTERVAL, ErrorMap
 from efficientnerf.asset.refinement.state import RefinementState
-from efficientnerf.asset.refinement.targets import Bundle, Targets
+from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
+from efficientnerf.asset.refinement.tiles import tiles_met
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.dispatch import fitting
+from efficientnerf.backends.layout import SSIM_WINDOW, Hyperparameters
 from efficientnerf.training.patches import Patches, PatchGrid
 
+MAX_PACKET_ANGLE = 0.02  # radians across patches whose rays share harmonics; docs/experiments/tree-training-kernels.md
 PATCH_SIDE = 4  # docs/experiments/tree-training-kernels.md
 WEIGHT_RAYS = 2**16  # of a bundle
 ERROR_PATCHES = 2**10  # of a bundle; the rays leave records
@@ -41,10 +45,29 @@ def optimise(
     total_variation          share, of the density's learning rate, of the differences between the logarithms of a voxel's and its neighbours' optical thickness
     error_map                share of the rays that are drawn by the errors of earlier ones, below 1
     """
-    yield from fitting(targets.backend).optimise(
-        state, targets, until=until, rays=rays, density_lr=density_lr, sh_lr=sh_lr, fall=fall, seed=seed, view_dependent_lr_ratio=view_dependent_lr_ratio,
-        patch_side=patch_side, total_variation=total_variation, error_map=error_map,
-    )  # fmt: skip
+    state.fetch()  # where steps were taken on a device before
+    patches = PatchGrid(targets.host_pixels, patch_side)
+    errors = ErrorMap(patches, tiles_met(state.tree, patches), state.errors, share=error_map)
+    state.errors = errors.errors
+    steps = fitting(targets.backend).Steps(state, targets.device, errors, smooth=total_variation > 0)
+    while state.step < until:
+        if state.step % INTERVAL == 0:
+            steps.record()
+            errors.set_chances()
+        number = state.step + 1
+        drawn, factor = errors.draw(rays, step_rng(seed, number)), fall(number)
+        rates = Hyperparameters(density_lr * factor, sh_lr * factor, view_dependent_lr_ratio, total_variation=total_variation)
+        origins, directions, wanted = targets.of(drawn.patches.pixels)
+        if patch_side != SSIM_WINDOW:
+            wanted = wanted._replace(structure=0.0)
+        found = steps.take(number, (origins, directions, wanted), drawn, rates, packets=_packets(patches, drawn.patches))
+        state.step = number
+        yield found
+
+
+def _packets(grid: PatchGrid, patches: Patches) -> np.ndarray | None:
+    """(P + 1,) first ray of each patch, and the end, where its rays share harmonics; None: each ray has its own."""
+    return patches.first if grid.angle <= MAX_PACKET_ANGLE else None
 
 
 def error(tree: NerfTree, targets: Targets, count: int, seed: int) -> float:
@@ -67,7 +90,8 @@ def error(tree: NerfTree, targets: Targets, count: int, seed: int) -> float:
                 if len(part.pixels):
                     yield part
 
-    total = fitting(targets.backend).total_loss(tree, targets, patches(), grid.angle)
+    losses = fitting(targets.backend).losses_of(tree, targets)
+    total = sum(losses(targets.of(part.pixels, constant_background=True), _packets(grid, part)) for part in patches())
     return float(total) / (3 * drawn)
 
 
@@ -77,16 +101,13 @@ def max_weights(tree: NerfTree, targets: Targets, count: int, seed: int, progres
     """
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 4, 0]))
     chosen = np.sort(targets.host_pixels.choose(count, rng))
-    bundles = _reported((targets.of(chosen[begin : begin + WEIGHT_RAYS]) for begin in range(0, count, WEIGHT_RAYS)), count, progress)
-    weights: np.ndarray = fitting(targets.backend).max_weights(tree, targets, bundles)
+
+    def bundles() -> Iterator[Bundle]:
+        for begin in range(0, count, WEIGHT_RAYS):
+            part = chosen[begin : begin + WEIGHT_RAYS]
+            yield targets.of(part)
+            if progress is not None:
+                progress(begin + len(part), count)
+
+    weights: np.ndarray = fitting(targets.backend).max_weights(tree, targets, bundles())
     return weights
-
-
-def _reported(bundles: Iterator[Bundle], count: int, progress: Callable[[int, int], None] | None) -> Iterator[Bundle]:
-    """The bundles, reporting the rays done after each."""
-    done = 0
-    for bundle in bundles:
-        yield bundle
-        done += len(bundle[0])
-        if progress is not None:
-            progress(done, count)

@@ -3,26 +3,24 @@
 N voxels, K harmonics, R rays.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
+import torch
 
-from efficientnerf.asset.refinement.error_map import INTERVAL, ErrorMap
+from efficientnerf.asset.refinement.error_map import Drawn, ErrorMap
 from efficientnerf.asset.refinement.state import RefinementState
-from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
-from efficientnerf.asset.refinement.tiles import tiles_met
+from efficientnerf.asset.refinement.targets import Bundle, Targets
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.layout import SSIM_WINDOW, Hyperparameters, Moments
+from efficientnerf.backends.layout import Hyperparameters, Moments
 from efficientnerf.backends.numba.tree import contributions
-from efficientnerf.backends.numba.tree.cells import cells_of, dense_densities, voxel_places
+from efficientnerf.backends.numba.tree.cells import Cells, cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training import gradients
-from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
+from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, Records, packets_of
 from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, neighbours_of
 from efficientnerf.backends.numba.tree_training.steps import step, values_of
 from efficientnerf.rendering.harmonics import basis_numpy
-from efficientnerf.training.patches import Patches, PatchGrid
-
-MAX_PACKET_ANGLE = 0.02  # radians across patches whose rays share harmonics; docs/experiments/tree-training-kernels.md
 
 
 def in_voxels(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -39,47 +37,40 @@ def packet_bases(bases: np.ndarray, first: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(mean, bases.dtype)
 
 
-def optimise(
-    state: RefinementState, targets: Targets, *, until: int, rays: int, density_lr: float, sh_lr: float, fall: Callable[[int], float], seed: int,
-    view_dependent_lr_ratio: float, patch_side: int, total_variation: float, error_map: float,
-) -> Iterator[float]:  # fmt: skip
-    """See `efficientnerf.asset.refinement.fit.optimise`."""
-    cells, buffer = cells_of(state.tree), RecordBuffer()
-    values = values_of(cells, state.density, state.sh)
-    patches = PatchGrid(targets.host_pixels, patch_side)
-    errors = ErrorMap(patches, tiles_met(state.tree, patches), state.errors, share=error_map)
-    state.errors = errors.errors
-    moments = Moments(state.square_density, state.square_sh, state.visits)
-    neighbours = neighbours_of(cells) if total_variation > 0 else NO_NEIGHBOURS
-    while state.step < until:
-        number = state.step + 1
-        if state.step % INTERVAL == 0:
-            errors.set_chances()
-        drawn = errors.draw(rays, step_rng(seed, number))
-        origins, directions, wanted = targets.of(drawn.patches.pixels)
-        if patch_side != SSIM_WINDOW:
-            wanted = wanted._replace(structure=0.0)
-        start, along, bases = in_voxels(state.tree, origins, directions)
-        first = drawn.patches.first if patches.angle <= MAX_PACKET_ANGLE else packets_of(len(start))
-        loss, records = gradients.forward_backward(cells, first, start, along, packet_bases(bases, first), values.dense, values.sh, wanted, buffer)
-        factor = fall(number)
-        rates = Hyperparameters(density_lr * factor, sh_lr * factor, view_dependent_lr_ratio, total_variation=total_variation)
-        step(records, values, moments, rates, neighbours)
-        state.step = number
-        yield errors.record(drawn, loss) / 3
+def _losses(
+    tree: NerfTree, cells: Cells, dense: np.ndarray, sh: np.ndarray, bundle: Bundle, packets: np.ndarray | None, buffer: RecordBuffer
+) -> tuple[np.ndarray, Records]:
+    """`gradients.forward_backward` of the rays of a bundle, in packets of which the first rays are (P + 1,), or one by one."""
+    origins, directions, wanted = bundle
+    start, along, bases = in_voxels(tree, origins, directions)
+    first = packets_of(len(start)) if packets is None else packets
+    return gradients.forward_backward(cells, first, start, along, packet_bases(bases, first), dense, sh, wanted, buffer)
 
 
-def total_loss(tree: NerfTree, targets: Targets, patches: Iterable[Patches], angle: float) -> float:
-    """Sum of the losses of the rays of patches, across which `angle` is that of `PatchGrid`; objects over the background of the scene."""
+class Steps:
+    """Steps that change a state; see `efficientnerf.asset.refinement.fit.optimise`."""
+
+    def __init__(self, state: RefinementState, device: torch.device, error_map: ErrorMap, *, smooth: bool) -> None:
+        self.tree, self.cells, self.buffer, self.error_map = state.tree, cells_of(state.tree), RecordBuffer(), error_map
+        self.values = values_of(self.cells, state.density, state.sh)
+        self.moments = Moments(state.square_density, state.square_sh, state.visits)
+        self.neighbours = neighbours_of(self.cells) if smooth else NO_NEIGHBOURS
+
+    def record(self) -> None:
+        """All losses are recorded as steps are taken."""
+
+    def take(self, number: int, bundle: Bundle, drawn: Drawn, rates: Hyperparameters, *, packets: np.ndarray | None) -> float:
+        """Mean squared error of a channel before the step."""
+        loss, records = _losses(self.tree, self.cells, self.values.dense, self.values.sh, bundle, packets, self.buffer)
+        step(records, self.values, self.moments, rates, self.neighbours)
+        return self.error_map.record(drawn, loss) / 3
+
+
+def losses_of(tree: NerfTree, targets: Targets) -> Callable[[Bundle, np.ndarray | None], Any]:
+    """The sum of the losses of the rays of a bundle, in packets or one by one, see `_losses`."""
     cells, buffer, sh = cells_of(tree), RecordBuffer(), tree.sh.reshape(len(tree.sh), tree.harmonics_count * 3)
-    dense, total = dense_densities(cells, voxel_places(cells, len(sh)), tree.density_values), 0.0
-    for part in patches:
-        origins, directions, wanted = targets.of(part.pixels, constant_background=True)
-        start, along, bases = in_voxels(tree, origins, directions)
-        first = part.first if angle <= MAX_PACKET_ANGLE else packets_of(len(start))
-        loss, _ = gradients.forward_backward(cells, first, start, along, packet_bases(bases, first), dense, sh, wanted, buffer)
-        total += float(loss.sum())
-    return total
+    dense = dense_densities(cells, voxel_places(cells, len(sh)), tree.density_values)
+    return lambda bundle, packets: _losses(tree, cells, dense, sh, bundle, packets, buffer)[0].sum()
 
 
 def max_weights(tree: NerfTree, targets: Targets, bundles: Iterable[Bundle]) -> np.ndarray:

@@ -48,6 +48,11 @@ class Targets:
         return "triton" if self.on_device else "numba"
 
     @property
+    def device(self) -> torch.device:
+        """Where they are."""
+        return self.pixels.device if isinstance(self.pixels, DevicePixels) else torch.device("cpu")
+
+    @property
     def host_pixels(self) -> Pixels:
         """The pixels where they are chosen."""
         return on_host(self.pixels)

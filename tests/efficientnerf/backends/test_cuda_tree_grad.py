@@ -158,13 +158,13 @@ def test_the_room_that_a_fit_takes_is_known_before() -> None:
 
     tree = random_tree(4, shape=(5, 5, 5), brick=4, degree=2, share=0.5)
     errors = ErrorMap(PatchGrid(pixels(2, 8), 4))
-    arrays = device.DeviceArrays(initial_state(tree), torch.device(DEVICE), errors, smooth=True)
+    arrays = device.Steps(initial_state(tree), torch.device(DEVICE), errors, smooth=True)
     tensors = [*arrays.values.values(), *arrays.neighbours, arrays.by_thickness, arrays.by_sh, arrays.stamp, arrays.grid.index, arrays.grid.cascades.owner]
     taken = sum(t.numel() * t.element_size() for t in tensors)
     # The grid is there once then; three times while it is sent.
     needed = needed_on_device(len(tree.density_values), 9, len(tree.voxel_index), tree.brick_index.size, 4, smooth=True)
     assert needed == taken + 8 * tree.brick_index.size
-    nest = device.DeviceArrays(initial_state(random_cascades(4)), torch.device(DEVICE), errors).grid
+    nest = device.Steps(initial_state(random_cascades(4)), torch.device(DEVICE), errors).grid
     assert nest.cascades.owner.numel() == 3 * 4**3
     assert len(nest.cascade_of) == len(random_cascades(4).density_values)
 
