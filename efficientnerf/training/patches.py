@@ -50,18 +50,21 @@ class PatchGrid:
                 found[self.first[view] : self.first[view + 1]] = within.reshape(-1)
         return found
 
+    def places(self, tile: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The view of each tile, and its row and column there."""
+        view = np.searchsorted(self.first, tile, side="right") - 1
+        return view, *np.divmod(tile - self.first[view], self.columns[view])
+
     def centres(self, tile: np.ndarray) -> np.ndarray:
         """The pixels at the middle of tiles, or where they reach beyond the image the last of a row or column."""
-        view = np.searchsorted(self.first, tile, side="right") - 1
-        row, column = np.divmod(tile - self.first[view], self.columns[view])
+        view, row, column = self.places(tile)
         y, x = (np.minimum(at * self.side + self.side // 2, sides[view] - 1) for at, sides in ((row, self.pixels.height), (column, self.pixels.width)))
         return self.pixels.offsets[view] + y * self.pixels.width[view] + x
 
     def drawn_from(self, tile: np.ndarray, rng: np.random.Generator) -> Patches:
         """Of each tile (P,) one of its patches, at random; those without a pixel are left out, so that none is empty."""
         back = rng.integers(self.side, size=(2, len(tile)))
-        view = np.searchsorted(self.first, tile, side="right") - 1
-        row, column = np.divmod(tile - self.first[view], self.columns[view])
+        view, row, column = self.places(tile)
         step = np.arange(self.side)
         y = (self.side * row - back[0])[:, None, None] + step[:, None]  # (P, side, 1)
         x = (self.side * column - back[1])[:, None, None] + step  # (P, 1, side)

@@ -42,13 +42,6 @@ def count_cells(patches: PatchGrid, tiles: int | None = None) -> int:
     return int((rows * columns).sum())
 
 
-def _with_pixels(met: np.ndarray | None, usable: np.ndarray | None) -> np.ndarray | None:
-    """(T,) bool: the tiles that are met and have a pixel that may be used; those that have one where none of them is met. None: all."""
-    if met is None or usable is None:
-        return usable if met is None else met
-    return met & usable if (met & usable).any() else usable
-
-
 class ErrorMap:
     """Chances of the tiles of a grid, in cells of so many tiles a side that there are MAX_CELLS at most.
 
@@ -68,7 +61,10 @@ class ErrorMap:
         self.errors = np.full((2, cells), -1, np.float32) if errors is None else errors
         if self.errors.shape != (2, cells) or self.errors.dtype != np.float32:
             raise ValueError(f"errors {self.errors.shape} {self.errors.dtype}: expected {(2, cells)} float32")
-        self.met = self._count_met(_with_pixels(met, patches.usable_tiles))
+        usable = patches.usable_tiles
+        if met is not None and usable is not None:
+            met = met & usable if (met & usable).any() else usable
+        self.met = self._count_met(usable if met is None else met)
         self._set_chances()
 
     def _count_met(self, met: np.ndarray | None) -> np.ndarray:
@@ -83,8 +79,7 @@ class ErrorMap:
     def _cell(self, tile: np.ndarray) -> np.ndarray:
         if self.tiles == 1:
             return tile
-        view = np.searchsorted(self.patches.first, tile, side="right") - 1
-        row, column = np.divmod(tile - self.patches.first[view], self.patches.columns[view])
+        view, row, column = self.patches.places(tile)
         found: np.ndarray = self.first[view] + row // self.tiles * self.columns[view] + column // self.tiles
         return found
 
