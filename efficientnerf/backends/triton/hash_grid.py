@@ -6,7 +6,6 @@ the byte.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,6 +16,7 @@ import triton.language as tl
 from torch import Tensor
 
 from efficientnerf.backends.torch.hash_grid import HashLevels, relu_network
+from efficientnerf.backends.transfer import constant
 from efficientnerf.backends.triton.launch import LANES, blocks
 from efficientnerf.backends.triton.vectors import Vec3
 from efficientnerf.fields.gradient_buffer import GradientBuffer
@@ -87,22 +87,11 @@ def _encode_backward(points, grad, levels, table_grad, samples, mask, L: tl.cons
         tl.atomic_add(table_grad + start * 2 + (entry[:, None] * 2 + feature[None, :]), weight[:, None] * g, mask=nonzero, sem="relaxed")
 
 
-@functools.lru_cache(maxsize=32)
-def _levels(sides: bytes, dense: bytes, starts: bytes, device: torch.device) -> Tensor:
-    """(L, 3) int64 resolution, start in the table, dense or not; cached, so that a step sends nothing."""
-    columns = [np.frombuffer(sides, np.int64), np.frombuffer(starts, np.int64), np.frombuffer(dense, np.bool_).astype(np.int64)]
-    return torch.from_numpy(np.stack(columns, axis=1)).to(device)
-
-
-def _levels_of(levels: HashLevels, device: torch.device) -> Tensor:
-    return _levels(levels.sides.astype(np.int64).tobytes(), levels.dense.astype(np.bool_).tobytes(), levels.starts.astype(np.int64).tobytes(), device)
-
-
 class _Encode(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, points: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
         points, count, mask = points.detach().contiguous(), len(levels.sides), int(levels.mask)
-        on_device = _levels_of(levels, points.device)
+        on_device = constant(np.stack([levels.sides, levels.starts, levels.dense], axis=1), points.new_empty(0, dtype=torch.int64))
         out = torch.empty(len(points), FEATURES * count, device=points.device)
         _encode[(blocks(len(points)), count)](points, table.detach(), on_device, out, len(points), mask, L=count, BLOCK=LANES)
         ctx.save_for_backward(points, on_device)
