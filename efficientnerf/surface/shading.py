@@ -3,7 +3,7 @@
 H x W pixels, s x s samples in each.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,16 +28,9 @@ class ColouredImage:
     depth: np.ndarray  # (H, W) float32 along the view axis of the nearest of them, infinite where there is none
 
 
-@dataclass(frozen=True, eq=False)
-class Pyramid:
-    """A texture at full size and at halves of it, down to a texel: texels (T, 3) uint8, and of each level first texel, width and height (L, 3)."""
-
-    texels: np.ndarray
-    levels: np.ndarray
-
-
-def pyramid_of(texture: Texture) -> Pyramid:
-    """Means of squares of four; at sides of an odd length the last texel counts twice."""
+def pyramid_of(texture: Texture) -> tuple[np.ndarray, np.ndarray]:
+    """A texture at full size and at halves of it, down to a texel: texels (T, 3) uint8, and of each level first texel, width and height (L, 3). They are
+    means of squares of four; at sides of an odd length the last texel counts twice."""
     parts, at = [], np.asarray(texture.colours)
     while True:
         parts.append(at)
@@ -50,7 +43,8 @@ def pyramid_of(texture: Texture) -> Pyramid:
         at = ((total + 2) // 4).astype(np.uint8)
     first = np.cumsum([0, *(part.shape[0] * part.shape[1] for part in parts)])
     levels = [(start, part.shape[1], part.shape[0]) for start, part in zip(first, parts)]
-    return Pyramid(np.concatenate([part.reshape(-1, 3) for part in parts]), np.array(levels, np.int64))
+    return np.concatenate([part.reshape(-1, 3) for part in parts]), np.array(levels, np.int64)
+
 
 NO_TEXTURE = np.zeros((0, 3, 2)), np.zeros((0, 3), np.uint8), np.zeros((0, 3), np.int64)  # as the kernel takes it
 
@@ -60,41 +54,33 @@ class Shader:
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
-        self.pyramid = None if mesh.texture is None else pyramid_of(mesh.texture)
         self.colours = np.ascontiguousarray(mesh.colours, np.float32)
         self.faces = np.ascontiguousarray(mesh.faces, np.int64)
-        self.coordinates = None if mesh.texture is None else np.ascontiguousarray(mesh.texture.coordinates, np.float64)
+        texture = mesh.texture
+        self.texture = NO_TEXTURE if texture is None else (np.ascontiguousarray(texture.coordinates, np.float64), *pyramid_of(texture))
 
     def images(self, camera: Camera, samples: int = SAMPLES) -> tuple[ColouredImage, ColouredImage]:
         """The mesh in the colours of its texture (of its vertices, where it has none), and in those of its vertices."""
         fine = resized(camera, camera.width * samples, camera.height * samples)
         rows = max(1, AT_ONCE // (samples**2 * camera.width)) * samples
-        bands = []
+        bands, kinds = [], (False,) if self.mesh.texture is None else (False, True)
         for begin in range(0, fine.height, rows):
             band = rows_of(fine, begin, min(begin + rows, fine.height))
             pixels, depth = project(band, self.mesh.vertices)
             seen = mesh_image(self.mesh.vertices, self.faces, band)
-            bands.append([self._shaded(seen, pixels, depth, samples, textured=textured) for textured in ((False,) if self.pyramid is None else (False, True))])
-        images = [_stacked(parts) for parts in zip(*bands, strict=True)]
+            bands.append([self._shaded(seen, pixels, depth, samples, textured=textured) for textured in kinds])
+        images = [ColouredImage(*map(np.concatenate, zip(*(vars(band).values() for band in parts), strict=True))) for parts in zip(*bands, strict=True)]
         return images[-1], images[0]
 
     def _shaded(self, seen: MeshImage, pixels: np.ndarray, depth: np.ndarray, samples: int, *, textured: bool) -> ColouredImage:
         height, width = (side // samples for side in seen.face.shape)
         colour = np.zeros((height, width, 3), np.float32)
-        texture = NO_TEXTURE if self.pyramid is None or not textured else (self.coordinates, self.pyramid.texels, self.pyramid.levels)
         for part in pieces(height, first=FIRST_ROWS):
-            shade(pixels, depth, self.faces, *texture, self.colours, seen.face, part.start, part.stop, colour)
+            shade(pixels, depth, self.faces, *(self.texture if textured else NO_TEXTURE), self.colours, seen.face, part.start, part.stop, colour)
         colour *= np.float32(1 / (samples**2 * (255 if textured else 1)))
         covered = _over_samples(seen.covered, samples)
         nearest = _over_samples(seen.depth, samples)
         return ColouredImage(np.clip(colour, 0, 1), covered.mean(2, dtype=np.float32), nearest.min(2))
-
-
-def _stacked(parts: Sequence[ColouredImage]) -> ColouredImage:
-    """One image of bands of rows."""
-    if len(parts) == 1:
-        return parts[0]
-    return ColouredImage(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("colour", "covered", "depth")))
 
 
 def _over_samples(values: np.ndarray, samples: int) -> np.ndarray:
