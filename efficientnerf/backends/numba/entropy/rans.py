@@ -14,6 +14,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from efficientnerf.backends.numba.runtime import PRANGE, numba
+from efficientnerf.backends.numba.vector import emit
 from efficientnerf.backends.numba.vector.memory import advanced, pointer, pointers
 
 BITS = 14  # of probabilities
@@ -50,11 +51,8 @@ class Slice(NamedTuple):
 @intrinsic
 def digits(typing_context: Any, value: Any) -> Any:
     """Number of binary digits of an int64 that is not negative."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.sub(ir.Constant(ir.IntType(64), 64), builder.ctlz(args[0], ir.Constant(ir.IntType(1), 0)))
-
-    return types.int64(types.int64), codegen
+    count = emit.emits(lambda builder, value: builder.sub(emit.index(64), builder.ctlz(value, ir.Constant(emit.I1, 0))))
+    return types.int64(types.int64), count
 
 
 @numba.njit(inline="always")

@@ -1,6 +1,6 @@
 """LLVM instructions on vectors, which intrinsics are made of. A value is a number or a vector of LLVM."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,18 @@ I1, I16, I32, I64, F32 = ir.IntType(1), ir.IntType(16), ir.IntType(32), ir.IntTy
 
 # Minimax polynomial of 2^-f = 1 + f (c_0 + f (c_1 + ...)) on [0, 1], exact at 0: maximum error 6e-8.
 EXP2_COEFFICIENTS = (-0.69314442, 0.24018671, -0.05531669, 0.00922838, -0.00095403)
+
+
+def emits(body: Callable[..., Any]) -> Callable[..., Any]:
+    """The code generator of an intrinsic: body (builder, *arguments) -> value, or a list of those of a tuple, or None."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        value = body(builder, *args)
+        if value is None:
+            return context.get_dummy_value()
+        return context.make_tuple(builder, signature.return_type, value) if isinstance(value, list) else value
+
+    return codegen
 
 
 def index(n: int) -> Any:

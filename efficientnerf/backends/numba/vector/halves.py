@@ -54,12 +54,8 @@ def _narrow(builder: Any, value: Any) -> Any:
 @intrinsic
 def store_halves(typing_context: Any, address: Any, index: Any, value: Any) -> Any:
     """p[index : index + count] = a vector of float32 rounded to half floats, for a pointer to uint16; beyond GREATEST it is that, and NaN -GREATEST."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        emit.store(builder, args[0], args[1], _narrow(builder, args[2]))
-        return context.get_dummy_value()
-
-    return types.void(types.CPointer(types.uint16), types.int64, value), codegen
+    store = emit.emits(lambda builder, address, index, value: emit.store(builder, address, index, _narrow(builder, value)))
+    return types.void(types.CPointer(types.uint16), types.int64, value), store
 
 
 def _mix_two(builder: Any, weights: Any, voxels: Any, values: Any, lane: int, count: int) -> Any:
@@ -87,14 +83,14 @@ def mix_pairs(typing_context: Any, weights: Any, voxels: Any, values: Any, count
     """
     lanes = count.literal_value
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def body(builder: Any, weights: Any, voxels: Any, values: Any, count: Any) -> list[Any]:
         fours = []
         for lane in range(0, lanes, 4):
-            one, other = (_mix_two(builder, args[0], args[1], args[2], lane + m, lanes) for m in (0, 2))
+            one, other = (_mix_two(builder, weights, voxels, values, lane + m, lanes) for m in (0, 2))
             low, high = (emit.shuffle(builder, one, other, [8 * (m // 4) + m % 4 + at for m in range(16)]) for at in (0, 4))
             fours.append(builder.fadd(low, high))
         whole = emit.concatenate(builder, fours)
-        return context.make_tuple(builder, signature.return_type, [emit.shuffle(builder, whole, whole, range(n, 4 * lanes, 4)) for n in range(4)])
+        return [emit.shuffle(builder, whole, whole, range(n, 4 * lanes, 4)) for n in range(4)]
 
     result = types.UniTuple(Vector(types.float32, lanes), 4)
-    return result(types.CPointer(types.float32), types.CPointer(types.int32), types.CPointer(types.uint16), count), codegen
+    return result(types.CPointer(types.float32), types.CPointer(types.int32), types.CPointer(types.uint16), count), emit.emits(body)

@@ -22,7 +22,7 @@ def broadcast(typing_context: Any, value: Any, count: Any) -> Any:
     """A scalar, float32, float64 or an integer, in so many lanes."""
     kind = types.unliteral(value)
     vector = Vector(element_of(kind), count.literal_value)
-    return vector(kind, count), lambda context, builder, signature, args: spread(builder, args[0], kind, vector.count)
+    return vector(kind, count), emit.emits(lambda builder, value, count: spread(builder, value, kind, vector.count))
 
 
 def broadcast_like(value, other):
@@ -41,28 +41,21 @@ def _broadcast_like(value, other):
 @intrinsic
 def pack(typing_context: Any, numbers: Any) -> Any:
     """A vector of the scalars of a tuple."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return emit.pack(builder, cgutils.unpack_tuple(builder, args[0], numbers.count))
-
-    return Vector(numbers.dtype, numbers.count)(numbers), codegen
+    count = numbers.count
+    return Vector(numbers.dtype, count)(numbers), emit.emits(lambda builder, numbers: emit.pack(builder, cgutils.unpack_tuple(builder, numbers, count)))
 
 
 @intrinsic
 def unpack(typing_context: Any, value: Any) -> Any:
     """The lanes as a tuple."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return context.make_tuple(builder, signature.return_type, emit.unpack(builder, args[0]))
-
-    return types.UniTuple(value.element, value.count)(value), codegen
+    return types.UniTuple(value.element, value.count)(value), emit.emits(emit.unpack)
 
 
 @intrinsic(prefer_literal=True)
 def lane_numbers(typing_context: Any, count: Any) -> Any:
     """0, 1, ... in so many lanes of float64."""
     vector = Vector(types.float64, count.literal_value)
-    return vector(count), lambda context, builder, signature, args: ir.Constant(vector.llvm, [float(n) for n in range(vector.count)])
+    return vector(count), emit.emits(lambda builder, count: ir.Constant(vector.llvm, [float(n) for n in range(vector.count)]))
 
 
 @intrinsic
@@ -70,10 +63,10 @@ def select(typing_context: Any, mask: Any, a: Any, b: Any) -> Any:
     """a where the mask is set, else b; vectors or scalars."""
     vector = vector_among(a, b) or mask.of(element_of(types.unliteral(a)))
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.select(args[0], *(spread(builder, arg, kind, vector.count) for arg, kind in zip(args[1:], (a, b), strict=True)))
+    def body(builder: Any, mask: Any, *args: Any) -> Any:
+        return builder.select(mask, *(spread(builder, arg, kind, vector.count) for arg, kind in zip(args, (a, b), strict=True)))
 
-    return vector(mask, a, b), codegen
+    return vector(mask, a, b), emit.emits(body)
 
 
 def _chosen(order: str) -> Any:
@@ -83,11 +76,11 @@ def _chosen(order: str) -> Any:
     def elementwise(typing_context: Any, a: Any, b: Any) -> Any:
         vector = vector_among(a, b)
 
-        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        def body(builder: Any, *args: Any) -> Any:
             left, right = (spread(builder, arg, kind, vector.count) for arg, kind in zip(args, (a, b), strict=True))
             return builder.select(builder.fcmp_ordered(order, left, right), left, right)
 
-        return vector(a, b), codegen
+        return vector(a, b), emit.emits(body)
 
     return elementwise
 
@@ -102,12 +95,11 @@ def fma(typing_context: Any, a: Any, b: Any, total: Any) -> Any:
     if vector is None and not a == b == total:
         raise TypeError(f"fma of {a}, {b} and {total}: expected numbers of one type")
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        if vector is not None:
-            args = [spread(builder, arg, kind, vector.count) for arg, kind in zip(args, (a, b, total), strict=True)]
-        return emit.fma(builder, *args)
+    def body(builder: Any, *args: Any) -> Any:
+        spread_out = args if vector is None else (spread(builder, arg, kind, vector.count) for arg, kind in zip(args, (a, b, total), strict=True))
+        return emit.fma(builder, *spread_out)
 
-    return (vector or a)(a, b, total), codegen
+    return (vector or a)(a, b, total), emit.emits(body)
 
 
 def _unary(name: str) -> Any:
@@ -115,7 +107,7 @@ def _unary(name: str) -> Any:
 
     @intrinsic
     def elementwise(typing_context: Any, value: Any) -> Any:
-        return value(value), lambda context, builder, signature, args: emit.call(builder, name, args[0])
+        return value(value), emit.emits(lambda builder, value: emit.call(builder, name, value))
 
     return elementwise
 
@@ -127,28 +119,28 @@ floor, ceil, absolute, sqrt = _unary("floor"), _unary("ceil"), _unary("fabs"), _
 def exp2_neg(typing_context: Any, value: Any) -> Any:
     """2^-x of a float32 or a vector of float32 for x >= 0, to 2e-7."""
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        bound = emit.constant(args[0].type, 126)
-        return emit.exp2(builder, builder.select(builder.fcmp_ordered(">", args[0], bound), bound, args[0]), 127)
+    def body(builder: Any, value: Any) -> Any:
+        bound = emit.constant(value.type, 126)
+        return emit.exp2(builder, builder.select(builder.fcmp_ordered(">", value, bound), bound, value), 127)
 
-    return value(value), codegen
+    return value(value), emit.emits(body)
 
 
 @intrinsic
 def sigmoid(typing_context: Any, value: Any) -> Any:
     """Logistic function 1 / (1 + exp(-x)) of a vector of float32, to 3e-6."""
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def body(builder: Any, value: Any) -> Any:
         def constant(x: float) -> Any:
-            return emit.constant(args[0].type, x)
+            return emit.constant(value.type, x)
 
         # exp(-x) = 2^-y = 2^(127 - n) 2^-f with y + 127 = n + f, 0 <= f < 1. n is positive, so truncation finds it.
-        y = emit.fma(builder, args[0], constant(math.log2(math.e)), constant(127))
+        y = emit.fma(builder, value, constant(math.log2(math.e)), constant(127))
         for bound, order in ((1.0, "<"), (253.0, ">")):
             y = builder.select(builder.fcmp_ordered(order, y, constant(bound)), constant(bound), y)
         return builder.fdiv(constant(1), builder.fadd(emit.exp2(builder, y, 254), constant(1)))
 
-    return value(value), codegen
+    return value(value), emit.emits(body)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -177,8 +169,8 @@ def _conversion(element: Any, names: dict[Any, str]) -> Any:
 
     @intrinsic
     def convert(typing_context: Any, value: Any) -> Any:
-        vector = value.of(element)
-        return vector(value), lambda context, builder, signature, args: getattr(builder, names[value.element])(args[0], vector.llvm)
+        vector, instruction = value.of(element), names[value.element]
+        return vector(value), emit.emits(lambda builder, value: getattr(builder, instruction)(value, vector.llvm))
 
     return convert
 
@@ -193,15 +185,15 @@ def sum_lanes(typing_context: Any, value: Any) -> Any:
     """Sum over the lanes of float32, by halves; of int32, as an int64."""
     whole = value.element == types.int32
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        total, count = args[0], value.count
+    def body(builder: Any, total: Any) -> Any:
+        count = value.count
         while count > 1:
             count //= 2
             total = (builder.add if whole else builder.fadd)(*(emit.shuffle(builder, total, total, range(n, n + count)) for n in (0, count)))
         total = builder.extract_element(total, ir.Constant(emit.I32, 0))
         return builder.sext(total, emit.I64) if whole else total
 
-    return (types.int64 if whole else value.element)(value), codegen
+    return (types.int64 if whole else value.element)(value), emit.emits(body)
 
 
 @intrinsic
@@ -209,9 +201,9 @@ def sum_each(typing_context: Any, values: Any) -> Any:
     """Sums over the lanes of each vector of a tuple, by halves as `sum_lanes`, in the first lanes of one; the rest are 0."""
     vector, given = values.dtype, values.count
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def body(builder: Any, values: Any) -> Any:
         zero, lanes = ir.Constant(vector.llvm, None), vector.count
-        vectors = [*cgutils.unpack_tuple(builder, args[0], given), *[zero] * (lanes - given)]
+        vectors = [*cgutils.unpack_tuple(builder, values, given), *[zero] * (lanes - given)]
         width = lanes  # lanes that still belong to one sum
         while width > 1:
             half = width // 2
@@ -226,34 +218,32 @@ def sum_each(typing_context: Any, values: Any) -> Any:
             vectors, width = joined, half
         return vectors[0]
 
-    return vector(values), codegen
+    return vector(values), emit.emits(body)
 
 
 @intrinsic
 def bits_of(typing_context: Any, mask: Any) -> Any:
     """Booleans as an int64, lane 0 the lowest bit."""
-    return types.int64(mask), lambda context, builder, signature, args: builder.zext(builder.bitcast(args[0], ir.IntType(mask.count)), emit.I64)
+    bits = ir.IntType(mask.count)
+    return types.int64(mask), emit.emits(lambda builder, mask: builder.zext(builder.bitcast(mask, bits), emit.I64))
 
 
 @intrinsic(prefer_literal=True)
 def mask_of(typing_context: Any, bits: Any, count: Any) -> Any:
     """Booleans of so many lowest bits of an int64."""
     vector = Vector(types.boolean, count.literal_value)
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.bitcast(builder.trunc(args[0], ir.IntType(vector.count)), vector.llvm)
-
-    return vector(types.int64, count), codegen
+    convert = emit.emits(lambda builder, bits, count: builder.bitcast(builder.trunc(bits, ir.IntType(vector.count)), vector.llvm))
+    return vector(types.int64, count), convert
 
 
 @intrinsic
 def lowest_bit(typing_context: Any, bits: Any) -> Any:
     """Number of the lowest set bit of an int64 other than 0."""
-    return types.int64(types.int64), lambda context, builder, signature, args: builder.cttz(args[0], ir.Constant(emit.I1, 1))
+    return types.int64(types.int64), emit.emits(lambda builder, bits: builder.cttz(bits, ir.Constant(emit.I1, 1)))
 
 
 @intrinsic
 def popcount(typing_context: Any, bits: Any) -> Any:
     """Number of set bits of an int64, or of each lane of int32."""
     kind = bits if isinstance(bits, Vector) else types.int64
-    return kind(kind), lambda context, builder, signature, args: emit.call(builder, "ctpop", args[0])
+    return kind(kind), emit.emits(lambda builder, bits: emit.call(builder, "ctpop", bits))

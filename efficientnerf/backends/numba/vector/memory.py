@@ -46,13 +46,13 @@ def pointers(typing_context: Any, record: Any) -> Any:
 @intrinsic
 def hold(typing_context: Any, arrays: Any) -> Any:
     """Does nothing with a tuple of arrays of a kernel, behind the last use of pointers to them: numba frees an array after the last line that names it."""
-    return types.void(arrays), lambda context, builder, signature, args: context.get_dummy_value()
+    return types.void(arrays), emit.emits(lambda builder, arrays: None)
 
 
 @intrinsic
 def advanced(typing_context: Any, address: Any, count: Any) -> Any:
     """Pointer to p[count]."""
-    return address(address, types.int64), lambda context, builder, signature, args: builder.gep(args[0], [args[1]])
+    return address(address, types.int64), emit.emits(lambda builder, address, count: builder.gep(address, [count]))
 
 
 @intrinsic
@@ -61,33 +61,24 @@ def fetch_add(typing_context: Any, address: Any, index: Any, amount: Any) -> Any
 
     Threads that take their next task so, when they are done with one, do not wait for each other's long ones.
     """
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.atomic_rmw("add", builder.gep(args[0], [args[1]]), args[2], "monotonic")
-
-    return types.int64(types.CPointer(types.int64), types.int64, types.int64), codegen
+    add = emit.emits(lambda builder, address, index, amount: builder.atomic_rmw("add", builder.gep(address, [index]), amount, "monotonic"))
+    return types.int64(types.CPointer(types.int64), types.int64, types.int64), add
 
 
 @intrinsic
 def prefetch(typing_context: Any, address: Any, index: Any) -> Any:
     """Ask for the cache line of p[index], and do not wait for it."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        emit.prefetch(builder, builder.gep(args[0], [args[1]]))
-        return context.get_dummy_value()
-
-    return types.void(address, types.int64), codegen
+    return types.void(address, types.int64), emit.emits(lambda builder, address, index: emit.prefetch(builder, builder.gep(address, [index])))
 
 
 @intrinsic
 def touch(typing_context: Any, address: Any, index: Any) -> Any:
     """Bring the cache line of p[index] of a pointer to float32 into the caches; an atomic load, which the compiler may not remove."""
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        builder.load_atomic(builder.bitcast(builder.gep(args[0], [args[1]]), emit.I32.as_pointer()), "monotonic", 4)
-        return context.get_dummy_value()
+    def body(builder: Any, address: Any, index: Any) -> None:
+        builder.load_atomic(builder.bitcast(builder.gep(address, [index]), emit.I32.as_pointer()), "monotonic", 4)
 
-    return types.void(_FLOATS, types.int64), codegen
+    return types.void(_FLOATS, types.int64), emit.emits(body)
 
 
 @intrinsic(prefer_literal=True)
@@ -96,22 +87,17 @@ def load(typing_context: Any, address: Any, index: Any, count: Any) -> Any:
     vector = Vector(element_of(address.dtype), count.literal_value)
     held = ir.VectorType(emit.I16, vector.count) if address.dtype == types.uint16 else vector.llvm
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        value = emit.load(builder, args[0], args[1], held)
+    def body(builder: Any, address: Any, index: Any, count: Any) -> Any:
+        value = emit.load(builder, address, index, held)
         return value if held == vector.llvm else builder.zext(value, vector.llvm)
 
-    return vector(address, types.int64, count), codegen
+    return vector(address, types.int64, count), emit.emits(body)
 
 
 @intrinsic
 def store(typing_context: Any, address: Any, index: Any, value: Any) -> Any:
     """p[index : index + count] = value for a pointer to float32, float64 or int32."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        emit.store(builder, args[0], args[1], args[2])
-        return context.get_dummy_value()
-
-    return types.void(address, types.int64, value), codegen
+    return types.void(address, types.int64, value), emit.emits(emit.store)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -149,38 +135,39 @@ def load_first(typing_context: Any, address: Any, index: Any, first: Any, count:
     """p[index : index + count] of a pointer to float32: the first `first` of them, and zeros; nothing else is read."""
     vector = Vector(types.float32, count.literal_value)
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind, mask = vector.llvm, emit.first_lanes(builder, args[2], vector.count)
+    def body(builder: Any, address: Any, index: Any, first: Any, count: Any) -> Any:
+        kind, mask = vector.llvm, emit.first_lanes(builder, first, vector.count)
         function = ir.FunctionType(kind, [kind.as_pointer(), emit.I32, mask.type, kind])
         masked = builder.module.declare_intrinsic(f"llvm.masked.load.v{vector.count}f32.p0v{vector.count}f32", (), function)
-        return builder.call(masked, [emit.address_of(builder, args[0], args[1], kind), ir.Constant(emit.I32, 4), mask, ir.Constant(kind, None)])
+        return builder.call(masked, [emit.address_of(builder, address, index, kind), ir.Constant(emit.I32, 4), mask, ir.Constant(kind, None)])
 
-    return vector(_FLOATS, types.int64, types.int64, count), codegen
+    return vector(_FLOATS, types.int64, types.int64, count), emit.emits(body)
 
 
 @intrinsic
 def store_first(typing_context: Any, address: Any, index: Any, value: Any, first: Any) -> Any:
     """p[index : index + first] = the first lanes of a vector of float32."""
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind, mask = value.llvm, emit.first_lanes(builder, args[3], value.count)
-        function = ir.FunctionType(ir.VoidType(), [kind, kind.as_pointer(), emit.I32, mask.type])
-        masked = builder.module.declare_intrinsic(f"llvm.masked.store.v{value.count}f32.p0v{value.count}f32", (), function)
-        builder.call(masked, [args[2], emit.address_of(builder, args[0], args[1], kind), ir.Constant(emit.I32, 4), mask])
-        return context.get_dummy_value()
+    kind, count = value.llvm, value.count
 
-    return types.void(_FLOATS, types.int64, value, types.int64), codegen
+    def body(builder: Any, address: Any, index: Any, value: Any, first: Any) -> None:
+        mask = emit.first_lanes(builder, first, count)
+        function = ir.FunctionType(ir.VoidType(), [kind, kind.as_pointer(), emit.I32, mask.type])
+        masked = builder.module.declare_intrinsic(f"llvm.masked.store.v{count}f32.p0v{count}f32", (), function)
+        builder.call(masked, [value, emit.address_of(builder, address, index, kind), ir.Constant(emit.I32, 4), mask])
+
+    return types.void(_FLOATS, types.int64, value, types.int64), emit.emits(body)
 
 
 @intrinsic
 def load_bytes8(typing_context: Any, address: Any, index: Any) -> Any:
     """The eight bytes from p[index] on as an int64, the first the lowest."""
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        value = builder.load(builder.bitcast(builder.gep(args[0], [args[1]]), emit.I64.as_pointer()), align=1)
+    def body(builder: Any, address: Any, index: Any) -> Any:
+        value = builder.load(builder.bitcast(builder.gep(address, [index]), emit.I64.as_pointer()), align=1)
         return value if sys.byteorder == "little" else builder.bswap(value)
 
-    return types.int64(address, types.int64), codegen
+    return types.int64(address, types.int64), emit.emits(body)
 
 
 @intrinsic(prefer_literal=True)
@@ -188,36 +175,35 @@ def load_cycle(typing_context: Any, address: Any, index: Any, begin: Any, count:
     """p[index], p[index + 1], p[index + 2], p[index] and so on of a pointer to float32, from number `begin` on; p[index + 3] is read."""
     vector = Vector(types.float32, count.literal_value)
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        four = emit.load(builder, args[0], args[1], ir.VectorType(emit.F32, 4))
+    def body(builder: Any, address: Any, index: Any, begin: Any, count: Any) -> Any:
+        four = emit.load(builder, address, index, ir.VectorType(emit.F32, 4))
         turns = [emit.shuffle(builder, four, four, [(n + turn) % 3 for n in range(vector.count)]) for turn in range(3)]
-        turn, found = builder.urem(args[2], emit.index(3)), turns[0]
+        turn, found = builder.urem(begin, emit.index(3)), turns[0]
         for n in (1, 2):
             found = builder.select(builder.icmp_signed("==", turn, emit.index(n)), turns[n], found)
         return found
 
-    return vector(_FLOATS, types.int64, types.int64, count), codegen
+    return vector(_FLOATS, types.int64, types.int64, count), emit.emits(body)
 
 
 @intrinsic
 def gather(typing_context: Any, address: Any, index: Any) -> Any:
     """The elements p[n] of a vector of int32, all of which must exist: float32 as such, int32 and uint8 as int32."""
-    vector = index.of(element_of(address.dtype))
+    vector, bytes_ = index.of(element_of(address.dtype)), address.dtype == types.uint8
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def body(builder: Any, address: Any, index: Any) -> Any:
         out = ir.Constant(vector.llvm, ir.Undefined)
         for n in range(vector.count):
-            value = builder.load(builder.gep(args[0], [builder.sext(builder.extract_element(args[1], emit.index(n)), emit.I64)]))
-            out = builder.insert_element(out, builder.zext(value, emit.I32) if address.dtype == types.uint8 else value, emit.index(n))
+            value = builder.load(builder.gep(address, [builder.sext(builder.extract_element(index, emit.index(n)), emit.I64)]))
+            out = builder.insert_element(out, builder.zext(value, emit.I32) if bytes_ else value, emit.index(n))
         return out
 
-    return vector(address, index), codegen
+    return vector(address, index), emit.emits(body)
 
 
-def _split(context: Any, builder: Any, signature: Any, whole: Any, size: int, count: int) -> Any:
+def _split(builder: Any, whole: Any, size: int, count: int) -> list[Any]:
     """Groups of `size` numbers: the first of each as a vector, the second and so on."""
-    vectors = [emit.shuffle(builder, whole, whole, range(n, size * count, size)) for n in range(size)]
-    return context.make_tuple(builder, signature.return_type, vectors)
+    return [emit.shuffle(builder, whole, whole, range(n, size * count, size)) for n in range(size)]
 
 
 @intrinsic(prefer_literal=True)
@@ -225,11 +211,10 @@ def load_groups(typing_context: Any, address: Any, index: Any, size: Any, count:
     """`count` groups of `size` float32 or int32 from p[index] on: a tuple of the first of each as a vector, the second and so on."""
     vector, each = Vector(element_of(address.dtype), count.literal_value), size.literal_value
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        whole = emit.load(builder, args[0], args[1], ir.VectorType(vector.llvm.element, each * vector.count))
-        return _split(context, builder, signature, whole, each, vector.count)
+    def body(builder: Any, address: Any, index: Any, size: Any, count: Any) -> list[Any]:
+        return _split(builder, emit.load(builder, address, index, ir.VectorType(vector.llvm.element, each * vector.count)), each, vector.count)
 
-    return types.UniTuple(vector, each)(address, types.int64, size, count), codegen
+    return types.UniTuple(vector, each)(address, types.int64, size, count), emit.emits(body)
 
 
 @intrinsic(prefer_literal=True)
@@ -238,27 +223,27 @@ def gather_groups(typing_context: Any, address: Any, places: Any, at: Any, size:
     vector, each = Vector(types.int32, count.literal_value), size.literal_value
     group = ir.VectorType(emit.I32, each)
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def body(builder: Any, address: Any, places: Any, at: Any, size: Any, count: Any) -> list[Any]:
         parts = []
         for n in range(vector.count):
-            place = builder.load(builder.gep(args[1], [builder.add(args[2], emit.index(n))]))
-            parts.append(emit.load(builder, args[0], builder.sext(place, emit.I64), group))
-        return _split(context, builder, signature, emit.concatenate(builder, parts), each, vector.count)
+            place = builder.load(builder.gep(places, [builder.add(at, emit.index(n))]))
+            parts.append(emit.load(builder, address, builder.sext(place, emit.I64), group))
+        return _split(builder, emit.concatenate(builder, parts), each, vector.count)
 
-    return types.UniTuple(vector, each)(_INTS, _INTS, types.int64, size, count), codegen
+    return types.UniTuple(vector, each)(_INTS, _INTS, types.int64, size, count), emit.emits(body)
 
 
 @intrinsic(prefer_literal=True)
 def prefetch_groups(typing_context: Any, address: Any, places: Any, count: Any) -> Any:
     """`prefetch` of p[4 n] for each n of the first `count` of a pointer to int32."""
+    lanes = count.literal_value
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        for n in range(count.literal_value):
-            place = builder.sext(builder.load(builder.gep(args[1], [emit.index(n)])), emit.I64)
-            emit.prefetch(builder, builder.gep(args[0], [builder.shl(place, emit.index(2))]))
-        return context.get_dummy_value()
+    def body(builder: Any, address: Any, places: Any, count: Any) -> None:
+        for n in range(lanes):
+            place = builder.sext(builder.load(builder.gep(places, [emit.index(n)])), emit.I64)
+            emit.prefetch(builder, builder.gep(address, [builder.shl(place, emit.index(2))]))
 
-    return types.void(address, _INTS, count), codegen
+    return types.void(address, _INTS, count), emit.emits(body)
 
 
 def _interleaved(builder: Any, values: list[Any]) -> Any:
@@ -271,25 +256,24 @@ def _interleaved(builder: Any, values: list[Any]) -> Any:
 @intrinsic
 def store_groups(typing_context: Any, address: Any, index: Any, values: Any) -> Any:
     """The reverse of `load_groups`, for a pointer to float32: p[index] = a[0], p[index + 1] = b[0], ..., then a[1] and so on, of a tuple of vectors."""
+    size = values.count
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        emit.store(builder, args[0], args[1], _interleaved(builder, cgutils.unpack_tuple(builder, args[2], values.count)))
-        return context.get_dummy_value()
+    def body(builder: Any, address: Any, index: Any, values: Any) -> None:
+        emit.store(builder, address, index, _interleaved(builder, cgutils.unpack_tuple(builder, values, size)))
 
-    return types.void(_FLOATS, types.int64, values), codegen
+    return types.void(_FLOATS, types.int64, values), emit.emits(body)
 
 
 @intrinsic(prefer_literal=True)
 def store_rows(typing_context: Any, address: Any, index: Any, stride: Any, values: Any, width: Any) -> Any:
     """`store_groups` in rows of `width` lanes: those of row r from p[index + r stride] on."""
-    columns = width.literal_value
+    columns, count, size = width.literal_value, values.dtype.count, values.count
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        vectors, at = cgutils.unpack_tuple(builder, args[3], values.count), args[1]
-        for row in range(0, values.dtype.count, columns):
+    def body(builder: Any, address: Any, index: Any, stride: Any, values: Any, width: Any) -> None:
+        vectors = cgutils.unpack_tuple(builder, values, size)
+        for row in range(0, count, columns):
             parts = [emit.shuffle(builder, each, each, range(row, row + columns)) for each in vectors]
-            emit.store(builder, args[0], at, _interleaved(builder, parts))
-            at = builder.add(at, args[2])
-        return context.get_dummy_value()
+            emit.store(builder, address, index, _interleaved(builder, parts))
+            index = builder.add(index, stride)
 
-    return types.void(_FLOATS, types.int64, types.int64, values, width), codegen
+    return types.void(_FLOATS, types.int64, types.int64, values, width), emit.emits(body)

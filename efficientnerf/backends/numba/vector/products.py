@@ -229,29 +229,25 @@ def product_masked(a, b, c, count, rows, columns, mask, mask_start):
 def copy16(typing_context: Any, source: Any, at: Any, count: Any, target: Any, to: Any) -> Any:
     """target[to : to + 16] = source[at : at + 16], float32, zeros from the `count`-th on; converted to bfloat16 where target points to int16."""
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        source, at, count, target, to = args
+    def body(builder: Any, source: Any, at: Any, count: Any, target: Any, to: Any) -> None:
         _convert_and_store(builder, _first_lanes(builder, emit.load(builder, source, at, _FLOAT32), count), target, to)
-        return context.get_dummy_value()
 
-    return types.void(float_pointer, types.int64, types.int64, target, types.int64), codegen
+    return types.void(float_pointer, types.int64, types.int64, target, types.int64), emit.emits(body)
 
 
 @intrinsic
 def store_pairs16(typing_context: Any, source: Any, low: Any, high: Any, count: Any, target: Any, to: Any) -> Any:
     """target[to : to + 16] = pairs of source[low : low + 16] and source[high : high + 16], float32 or bfloat16 as int16; zeros from the `count`-th on."""
+    kind = _FLOAT32 if source == float_pointer else _INT16
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        source, low, high, count, target, to = args
-        kind = _FLOAT32 if signature.args[0] == float_pointer else _INT16
+    def body(builder: Any, source: Any, low: Any, high: Any, count: Any, target: Any, to: Any) -> None:
         halves = [emit.load(builder, source, at, kind) for at in (low, high)]
         if kind is _FLOAT32:
             halves = [_to_bfloat16(builder, value) for value in halves]
         first, second = (builder.zext(value, _INT32) for value in halves)
         emit.store(builder, target, to, _first_lanes(builder, builder.or_(first, builder.shl(second, emit.constant(_INT32, 16))), count))
-        return context.get_dummy_value()
 
-    return types.void(source, types.int64, types.int64, types.int64, pair_pointer, types.int64), codegen
+    return types.void(source, types.int64, types.int64, types.int64, pair_pointer, types.int64), emit.emits(body)
 
 
 def _first_lanes(builder: Any, value: Any, count: Any) -> Any:
@@ -262,10 +258,9 @@ def _first_lanes(builder: Any, value: Any, count: Any) -> Any:
 @intrinsic
 def transpose16(typing_context: Any, source: Any, at: Any, row: Any, target: Any, to: Any, column: Any) -> Any:
     """target[to + i column + j] = source[at + j row + i] for i, j < LANES; float32, or pairs, whose source may point to int16 as for `product`."""
+    kind = _FLOAT32 if target == float_pointer else _INT32
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        source, at, row, target, to, column = args
-        kind = _FLOAT32 if signature.args[3] == float_pointer else _INT32
+    def body(builder: Any, source: Any, at: Any, row: Any, target: Any, to: Any, column: Any) -> None:
         source = builder.bitcast(source, kind.element.as_pointer())
         lines = [emit.load(builder, source, builder.add(at, builder.mul(emit.index(n), row)), kind) for n in range(LANES)]
         for far in (1, 2, 4, 8):  # swap off-diagonal blocks of that side in blocks twice as large
@@ -276,10 +271,9 @@ def transpose16(typing_context: Any, source: Any, at: Any, row: Any, target: Any
                     lines[n], lines[n + far] = (emit.shuffle(builder, first, second, lanes) for lanes in (upper, lower))
         for n, line in enumerate(lines):
             emit.store(builder, target, builder.add(to, builder.mul(emit.index(n), column)), line)
-        return context.get_dummy_value()
 
     n = types.int64
-    return types.void(source, n, n, target, n, n), codegen
+    return types.void(source, n, n, target, n, n), emit.emits(body)
 
 
 def pack_row_pairs(source, width, target, count, padded_width):

@@ -68,10 +68,10 @@ def _overload(operation: Any, emits: dict[Any, Any], *, compares: bool = False) 
     def elementwise(typing_context: Any, a: Any, b: Any) -> Any:
         vector = vector_among(a, b)
 
-        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            return emits[vector.element](builder, *(spread(builder, arg, kind, vector.count) for arg, kind in zip(args, signature.args, strict=True)))
+        def body(builder: Any, *args: Any) -> Any:
+            return emits[vector.element](builder, *(spread(builder, arg, kind, vector.count) for arg, kind in zip(args, (a, b), strict=True)))
 
-        return (vector.of(types.boolean) if compares else vector)(a, b), codegen
+        return (vector.of(types.boolean) if compares else vector)(a, b), emit.emits(body)
 
     @overload(operation)
     def implementation(a, b):
@@ -104,7 +104,7 @@ for _operation, _order in ((operator.lt, "<"), (operator.le, "<="), (operator.gt
 
 @intrinsic
 def _inverted(typing_context: Any, mask: Any) -> Any:
-    return mask(mask), lambda context, builder, signature, args: builder.not_(args[0])
+    return mask(mask), emit.emits(lambda builder, mask: builder.not_(mask))
 
 
 @overload(operator.invert)
