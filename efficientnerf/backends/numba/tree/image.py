@@ -61,15 +61,15 @@ def beginning(threads: int) -> np.ndarray:
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def render_batch(
-    batch, background, packed, brick, view_colours, views, voxel, tile, threads, budget, progress,
+    batch, background, packed, brick, view_colours, view, voxel, tile, threads, budget, progress,
     colour, opacity, depth, normal,
 ):  # fmt: skip
     """Renders a RayBatch, or as much of it as each thread's budget allows; returns whether that was all.
 
     background     (3,) float32 colour to composite over
     packed         see `Packed`
-    view_colours   (N + 2, 4) uint16, half floats that are finite: see `compute_view_colours`, from row 1 on; not read where distances of the views are infinity
-    views          see `Views`
+    view_colours   (N + 2, 4) uint16, half floats that are finite: see `compute_view_colours`, from row 1 on; not read where distances of the view are infinity
+    view           of all cascades, see `View`
     voxel          size of a voxel of cascade 0, world units
     tile           (rows, columns) of a tile
     budget         of a thread's work, see WORK
@@ -95,7 +95,7 @@ def render_batch(
         )  # fmt: skip
         outputs = Outputs(width, pointer(colour), pointer(opacity), pointer(depth), pointer(normal), len(normal) > 0)
         rays = pointers(batch)
-        scene = Scene(cascades, packed_pointers(packed, brick, 0), pointer(packed.grids), pointer(packed.places), pointers(views))
+        scene = Scene(cascades, packed_pointers(packed, brick), pointer(packed.grids), pointer(packed.places), pointers(view))
         # The index is of another type where numba infers types than where it runs: as it is, the function would be compiled for both.
         _render_blocks(np.int64(worker), threads, budget, progress, height, tile, rays, background, scene, pointer(view_colours[1:]), voxel, scratch, outputs)
     rows, columns = BLOCK * tile[0], BLOCK * tile[1]

@@ -19,7 +19,7 @@ from efficientnerf.backends.numba.tree.march import LOG2E
 from efficientnerf.backends.numba.tree.packed import VOXELS_PER_CALL, packed_of
 from efficientnerf.backends.numba.tree.ray_batch import DIRECTION_TABLE, PINHOLE, RayBatch, given_rays
 from efficientnerf.backends.numba.tree.surroundings import add_environment
-from efficientnerf.backends.numba.tree.view_colours import Views, compute_view_colours
+from efficientnerf.backends.numba.tree.view_colours import View, compute_view_colours
 from efficientnerf.geometry.cameras import Camera, rays
 
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
@@ -40,9 +40,9 @@ def _allocate(height: int, width: int, *, normals: bool) -> tuple[np.ndarray, np
 class ViewColours(NamedTuple):
     """Colours of a tree's voxels for a view, see `compute_view_colours`, between two rows (N + 2, 4) uint16, and where they may be used, see `View`."""
 
-    views: Views
+    view: View
     colours: np.ndarray
-    view: bytes  # all that the colours depend on besides the tree; empty for none
+    key: bytes  # all that the colours depend on besides the tree; empty for none
 
 
 def _cone(camera: Camera) -> np.ndarray:
@@ -56,15 +56,15 @@ def _cone(camera: Camera) -> np.ndarray:
 
 def _view_colours(tree: NerfTree, view_direction: np.ndarray, cone: np.ndarray = EVERYWHERE) -> ViewColours:
     """Of all cascades, as far as the cone reaches; the direction is that of cascade 0. Those of the image before, if it was of the same view."""
-    views, view = _views(tree, view_direction, _near_distance(tree, view_direction)), view_direction.tobytes() + cone.tobytes()
+    view, key = _view(tree, view_direction, _near_distance(tree, view_direction)), view_direction.tobytes() + cone.tobytes()
     colours, before = _colour_buffer(tree)
-    if view != before:
+    if key != before:
         packed = packed_of(tree)
         for cascade, (begin, end) in enumerate(itertools.pairwise(packed.first_voxel.tolist())):
             for first in range(begin, end, VOXELS_PER_CALL):
-                given = views.direction[cascade], cone, views.density_scale[cascade], tree.degree
-                compute_view_colours(first, min(end, first + VOXELS_PER_CALL), cascade, packed, *given, colours[1:])
-    return ViewColours(views, colours, view)
+                given = view.direction[cascade], cone, view.density_scale[cascade], tree.degree
+                compute_view_colours(first, min(end, first + VOXELS_PER_CALL), packed, *given, colours[1:])
+    return ViewColours(view, colours, key)
 
 
 def _colour_buffer(tree: NerfTree) -> tuple[np.ndarray, bytes]:
@@ -80,17 +80,17 @@ def _keep_buffer(tree: NerfTree, colours: ViewColours) -> None:
     """Leaves the array of view colours, which nothing refers to any more, to the next image."""
     kept = tree.derived.setdefault("view_colours", [])
     if not kept and len(colours.colours) == len(tree.density_values) + 2:
-        kept.append((colours.colours, colours.view))
+        kept.append((colours.colours, colours.key))
 
 
-def _views(tree: NerfTree, view_direction: np.ndarray, min_distance: np.ndarray) -> Views:
-    """The view of each cascade, from the direction of cascade 0."""
+def _view(tree: NerfTree, view_direction: np.ndarray, min_distance: np.ndarray) -> View:
+    """The view of all cascades, from the direction of cascade 0."""
     ratio, shift = packed_of(tree).places[:, 0], packed_of(tree).places[:, 1:]
     matrix = np.broadcast_to(view_direction[:, :3], (len(ratio), 3, 3))  # directions may have any length: per voxel of each cascade
     at_zero = view_direction[:, 3] / ratio[:, None] - np.einsum("ij,lj->li", view_direction[:, :3], shift)
     scale = np.array([np.float32(tree.step_size * cascade.voxel * LOG2E) for cascade in cascades_of(tree)], np.float32)
     direction = np.concatenate([matrix, at_zero[..., None]], axis=2)
-    return Views(direction, float(np.linalg.norm(view_direction[:, :3], 2)), min_distance, scale, float(tree.step_size), tree.degree)
+    return View(direction, float(np.linalg.norm(view_direction[:, :3], 2)), min_distance, scale, float(tree.step_size), tree.degree)
 
 
 def _min_distance(tree: NerfTree) -> np.ndarray:
@@ -117,7 +117,7 @@ def _render(tree: NerfTree, batch: RayBatch, colours: ViewColours, background: n
     progress = beginning(threads)
     # In pieces: signals are answered between calls.
     while not render_batch(
-        batch, background, packed_of(tree), tree.brick, colours.colours, colours.views, float(tree.voxel), tile, threads, WORK, progress, *out
+        batch, background, packed_of(tree), tree.brick, colours.colours, colours.view, float(tree.voxel), tile, threads, WORK, progress, *out
     ):
         pass
 
@@ -146,7 +146,7 @@ def render_rays(
     if len(origins):
         shared = eye is not None and _any_far(tree, view_direction)
         never = np.full(len(packed_of(tree).grids), np.inf)
-        colours = _view_colours(tree, view_direction) if shared else ViewColours(_views(tree, view_direction, never), np.zeros((2, 4), np.uint16), b"")
+        colours = _view_colours(tree, view_direction) if shared else ViewColours(_view(tree, view_direction, never), np.zeros((2, 4), np.uint16), b"")
         _render(tree, batch, colours, np.zeros(3, np.float32), (1, TILE * TILE) if rows == 1 else (TILE, TILE), out)
         if shared:
             _keep_buffer(tree, colours)
@@ -157,11 +157,11 @@ def render_rays(
 def _any_far(tree: NerfTree, view_direction: np.ndarray) -> bool:
     """Whether any voxel is at least `_min_distance` away."""
     grids, least = packed_of(tree).grids, _min_distance(tree)
-    views = _views(tree, view_direction, least)
-    for n, direction in enumerate(views.direction):
+    view = _view(tree, view_direction, least)
+    for n, direction in enumerate(view.direction):
         corners = np.stack(np.meshgrid(*((0, cells * tree.brick) for cells in grids[n, :3]), indexing="ij"), -1).reshape(-1, 3)
         farthest = np.linalg.norm(corners @ direction[:, :3].T + direction[:, 3], axis=1).max()  # the length is convex: greatest at a corner
-        if farthest > least[n] * views.direction_rate:
+        if farthest > least[n] * view.direction_rate:
             return True
     return False
 
@@ -183,19 +183,14 @@ def _camera_directions(model: str, params: tuple[float, ...], width: int, height
     return rays(camera, pixels)[1].astype(np.float32).reshape(*x.shape, 3)
 
 
-def _camera_centre(tree: NerfTree, camera: Camera) -> np.ndarray:
-    """(3,) voxel coordinates, of the world for a tree in normalised device coordinates."""
-    centre = np.array(camera.centre, np.float64)
-    return centre if tree.ndc is not None else (centre - tree.bounds_min) / tree.voxel
-
-
 def _camera_batch(tree: NerfTree, camera: Camera, supersample: int, top: int, low: int) -> RayBatch:
     """The rays of rows top to low of a camera's image."""
     kind, table, none = PINHOLE, np.zeros((0, 0, 3), np.float32), np.zeros((0, 0, 3))
     if camera.model not in PINHOLES:
         kind, table = DIRECTION_TABLE, _camera_directions(camera.model, camera.params, camera.width, camera.height, supersample, top, low)
     fx, fy, cx, cy = (float(camera.intrinsics[name]) for name in ("fx", "fy", "cx", "cy"))
-    rotation, (x, y, z) = np.ascontiguousarray(camera.world_from_camera[:3, :3], np.float64), _camera_centre(tree, camera).tolist()
+    rotation, centre = np.ascontiguousarray(camera.world_from_camera[:3, :3], np.float64), np.array(camera.centre, np.float64)
+    x, y, z = (centre if tree.ndc is not None else (centre - tree.bounds_min) / tree.voxel).tolist()
     ndc = np.zeros(0) if tree.ndc is None else np.concatenate([ndc_numbers(tree.ndc), tree.bounds_min, [tree.voxel]])
     return RayBatch(
         kind, table.shape[1], fx, fy, cx, cy, 1 / supersample, top * supersample, rotation, x, y, z, table, none, none,

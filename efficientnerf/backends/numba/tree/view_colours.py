@@ -31,9 +31,9 @@ _C4 = tuple(np.float32(c) for c in harmonics.C4)
 
 
 class View(NamedTuple):
-    """What of a view its voxels' colours depend on.
+    """What of a view its voxels' colours depend on; in the view of all cascades the direction, `min_distance` and `density_scale` are arrays (L, ...).
 
-    direction       12 numbers, (3, 4): maps a point (x, y, z, 1), voxel coordinates, to the direction along which it is seen, of any length, in the
+    direction       (3, 4): maps a point (x, y, z, 1), voxel coordinates, to the direction along which it is seen, of any length, in the
                     harmonics' frame
     direction_rate  change of that direction per voxel, at most
     min_distance    voxels from the point whose direction is zero, on the scale of `direction_rate`, within which a voxel's direction differs too much from that
@@ -46,19 +46,8 @@ class View(NamedTuple):
 
     direction: Any
     direction_rate: float
-    min_distance: float
-    density_scale: np.float32
-    step: float
-    degree: int
-
-
-class Views(NamedTuple):
-    """A View of each cascade: direction (L, 3, 4), min_distance (L,), density_scale (L,) float32; the rest is common to all."""
-
-    direction: np.ndarray
-    direction_rate: float
-    min_distance: np.ndarray
-    density_scale: np.ndarray
+    min_distance: Any
+    density_scale: Any
     step: float
     degree: int
 
@@ -104,17 +93,15 @@ class PackedPointers(NamedTuple):
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def packed_pointers(packed, brick, cascade):
-    """See `PackedPointers`."""
+def packed_pointers(packed, brick):
+    """The first cascade, see `PackedPointers`."""
     grids, places = packed.grids, packed.places
-    first = grids[cascade, 3]
     return PackedPointers(
-        brick, grids[cascade, 0], grids[cascade, 1], grids[cascade, 2], places[cascade, 0], places[cascade, 1], places[cascade, 2], places[cascade, 3],
-        advanced(pointer(packed.leap), first),
-        advanced(pointer(packed.octants), 8 * first) if len(packed.octants) > 0 else advanced(pointer(packed.leap), first), len(packed.octants) > 0,
+        brick, grids[0, 0], grids[0, 1], grids[0, 2], places[0, 0], places[0, 1], places[0, 2], places[0, 3],
+        pointer(packed.leap), pointer(packed.octants) if len(packed.octants) > 0 else pointer(packed.leap), len(packed.octants) > 0,
         pointer(packed.has_density.view(np.int32)), packed.has_density.shape[1], pointer(packed.rows),
         packed.rows.shape[1] == (brick + 2) * (brick + 2), len(packed.voxel_of) - 1, pointer(packed.voxel_of),
-        advanced(pointer(packed.brick_index), first), pointer(packed.density), packed.sh.shape[1], len(packed.codes) > 0, pointer(packed.sh),
+        pointer(packed.brick_index), pointer(packed.density), packed.sh.shape[1], len(packed.codes) > 0, pointer(packed.sh),
         pointer(packed.base), pointer(packed.base_table), pointer(packed.codes), packed.codes.shape[1], pointer(packed.palette), packed.palette.shape[1],
         pointer(packed.code_columns),
     )  # fmt: skip
@@ -207,12 +194,12 @@ def view_direction(x, y, z, direction):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _colours(first, end, cascade, packed, direction, cone, density_scale, degree, basis, out):
+def _colours(first, end, packed, direction, cone, density_scale, degree, basis, out):
     """`compute_view_colours`, one after the other; directions and harmonics are those of sixteen voxels at once.
 
     basis  (K, 16) float32, scratch
     """
-    grid, d, voxels = packed_pointers(packed, 1, cascade), direction, packed.coordinates.shape[1]
+    grid, d, voxels = packed_pointers(packed, 1), direction, packed.coordinates.shape[1]
     at, half = pointer(packed.coordinates), 0.5
     eight = grid.coded and grid.terms == 9 and grid.groups == 8 and grid.entries == 256 and packed.codes.itemsize == 1
     # To the middle of the first voxel, and from there by whole voxels.
@@ -243,7 +230,7 @@ def _colours(first, end, cascade, packed, direction, cone, density_scale, degree
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def compute_view_colours(first, end, cascade, packed, direction, cone, density_scale, degree, out):
+def compute_view_colours(first, end, packed, direction, cone, density_scale, degree, out):
     """Scaled density, and red, green and blue before the sigmoid, along `direction` (see `View`), of voxels first <= n < end of the packed order, all of one
     cascade, into out (N + 1, 4) uint16, the bits of half floats.
 
@@ -254,7 +241,6 @@ def compute_view_colours(first, end, cascade, packed, direction, cone, density_s
     """
     for task in numba.prange((end - first + VOXELS_PER_TASK - 1) // VOXELS_PER_TASK):
         basis, begin = np.empty(16 * MOST_HARMONICS, np.float32), first + VOXELS_PER_TASK * task
-        _colours(
-            begin, min(end, begin + VOXELS_PER_TASK), cascade, packed, pointer(direction), pointer(cone), density_scale, degree, pointer(basis), pointer(out)
-        )  # fmt: skip
+        end_of_task = min(end, begin + VOXELS_PER_TASK)
+        _colours(begin, end_of_task, packed, pointer(direction), pointer(cone), density_scale, degree, pointer(basis), pointer(out))
         hold((basis,))

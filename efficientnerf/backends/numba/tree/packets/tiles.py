@@ -12,18 +12,18 @@ from efficientnerf.backends.numba.tree.packets.layout import LANES
 from efficientnerf.backends.numba.tree.packets.march import march
 from efficientnerf.backends.numba.tree.packets.pixels import write_clear, write_packet
 from efficientnerf.backends.numba.tree.ray_batch import PINHOLE, clear_distance, tile_rays
-from efficientnerf.backends.numba.tree.view_colours import PackedPointers, View, Views
+from efficientnerf.backends.numba.tree.view_colours import PackedPointers, View
 from efficientnerf.backends.numba.vector.memory import advanced
 
 
 class Scene(NamedTuple):
-    """All cascades of a packed tree, of which `base` is the first, and the views of them, with arrays as pointers; see `Packed`."""
+    """All cascades of a packed tree, of which `base` is the first, and the views of all, with arrays as pointers; see `Packed`."""
 
     cascades: int
     base: PackedPointers
     grids: Any
     places: Any
-    views: Views
+    views: View
 
 
 class Tile(NamedTuple):
@@ -65,8 +65,8 @@ def _cascade(n, scene):
         base.mask_words, base.rows, base.narrow, base.voxels, base.voxel_of, advanced(base.brick_index, first), base.density, base.terms, base.coded,
         base.sh, base.base, base.base_table, base.codes, base.groups, base.palette, base.entries, base.code_columns,
     )  # fmt: skip
-    views = scene.views
-    return grid, View(advanced(views.direction, 12 * n), views.direction_rate, views.min_distance[n], views.density_scale[n], views.step, views.degree)
+    view = scene.views
+    return grid, View(advanced(view.direction, 12 * n), view.direction_rate, view.min_distance[n], view.density_scale[n], view.step, view.degree)
 
 
 @numba.njit(cache=True, error_model="numpy")
