@@ -156,7 +156,7 @@ def model(
     coarse_samples = resolved(settings.num_coarse_samples) or space.num_coarse_samples
     settings = replace(settings, num_coarse_samples=coarse_samples)
     generator = torch.Generator().manual_seed(settings.seed)
-    coarse, fine = _fields(settings, generator) if fields is None else fields
+    coarse, fine = fields or import_module(f"efficientnerf.fields.{settings.field}").coarse_and_fine(settings, generator)
     if resolved(settings.far_plane) is None:
         span = None
     elif span is None or space.contracted:
@@ -167,12 +167,6 @@ def model(
     strategy = _strategy(settings, intervals)
     fields = (coarse.to(device), fine.to(device))
     return Model(space, settings, *fields, voxels, strategy, Sky().to(device), background, coarse_samples, step, intervals.max_intervals)
-
-
-def _fields(settings: TrainSettings, generator: torch.Generator) -> tuple[Field, Field]:
-    """The coarse field and the fine one, untrained."""
-    pair: tuple[Field, Field] = import_module(f"efficientnerf.fields.{settings.field}").coarse_and_fine(settings, generator)
-    return pair
 
 
 def _voxels(s: TrainSettings, space: Space, step: float, device: str) -> DensityVoxels:

@@ -80,7 +80,9 @@ def economy_of(tree: NerfTree, weight: np.ndarray | None = None, entries: int = 
     found = []
     for k in range(1, tree.harmonics_count):
         palette, codes = clustered(np.ascontiguousarray(voxels.sh[:, k], np.float32), voxels.worth, entries, seed=k)
-        found.append(_sorted(codes, palette))
+        order_of_entries = np.argsort(-np.bincount(codes, minlength=len(palette)), kind="stable")  # those that occur most first
+        ranked = np.argsort(order_of_entries)[codes].astype(np.uint8)
+        found.append((ranked, np.ascontiguousarray(palette[order_of_entries], np.float32)))
     return Economy(tree, order, voxels, found)
 
 
@@ -192,12 +194,6 @@ def _code_bits(codes: np.ndarray, voxels: _Voxels, beside: np.ndarray, entries: 
     for begin in range(0, len(codes), streams.PIECE):
         choices.count_codes(codes, voxels.neighbours, situation, counts, begin, min(len(codes), begin + streams.PIECE))
     return _bits(counts[:split, :4]), _bits(counts[split:, :entries])
-
-
-def _sorted(codes: np.ndarray, palette: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Codes (N,) uint8 and palette with the entries that occur most first."""
-    order = np.argsort(-np.bincount(codes, minlength=len(palette)), kind="stable")
-    return np.argsort(order)[codes].astype(np.uint8), np.ascontiguousarray(palette[order], np.float32)
 
 
 def _centred(palette: np.ndarray, codes: np.ndarray, vectors: np.ndarray, weight: np.ndarray) -> np.ndarray:

@@ -85,7 +85,8 @@ def find_subject(
     centres = np.array([camera.centre for camera in cameras])
     ring = np.linalg.norm(centres[:, :2] - focus[:2], axis=1)
     inside = np.linalg.norm(cells.centres[:, :2] - focus[:2], axis=1) <= max(0.9 * float(np.median(ring)), 0.5 * reach)
-    round_it = _all_round(centres, focus)
+    azimuth = np.sort(np.arctan2(*(centres - focus)[:, 1::-1].T))
+    round_it = bool(np.diff(np.append(azimuth, azimuth[0] + 2 * np.pi)).max() < np.pi)  # the cameras stand on all sides: no gap of half a turn
     close = trusted & (cells.distance <= FARTHEST * reach) & (cells.nearest >= 0.1 * reach) & (inside | (not round_it))
     observed = close & (share >= OBSERVED)
     if not observed.any():
@@ -134,12 +135,6 @@ def find_focus(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, camera
         focus = np.median(seen, axis=0)
         converging = bool(off <= 0.35 * reach and off <= 0.5 * max(float(np.median(np.linalg.norm(centres - focus, axis=1))), 1e-9))
     return focus, reach, converging
-
-
-def _all_round(centres: np.ndarray, focus: np.ndarray) -> bool:
-    """Whether the cameras stand on all sides of a point: no gap of half a turn."""
-    azimuth = np.sort(np.arctan2(*(centres - focus)[:, 1::-1].T))
-    return bool(np.diff(np.append(azimuth, azimuth[0] + 2 * np.pi)).max() < np.pi)
 
 
 def _subject(cells: Cells, candidates: np.ndarray, observed: np.ndarray) -> np.ndarray:

@@ -69,7 +69,10 @@ def detect_forward_facing(cameras: Sequence[Camera], depths: np.ndarray) -> Forw
         radii=(float(radii[0]), float(radii[1]), float(radii[2])),
         # As in LLFF and NeRF: three quarters of the way from near to far, in inverse depth.
         focus=float(1 / (0.25 / (0.9 * np.nanmin(depths[:, 0])) + 0.75 / (5 * np.nanmax(depths[:, 1])))),
-        tangents=_common_field_of_view(cameras),
+        tangents=(
+            min(float(0.5 * camera.width / camera.intrinsics["fx"]) for camera in cameras),
+            min(float(0.5 * camera.height / camera.intrinsics["fy"]) for camera in cameras),
+        ),
     )
 
 
@@ -129,9 +132,3 @@ def ndc_bounds(ndc: Ndc, cameras: Sequence[Camera]) -> np.ndarray:
     low, high = corners.min(0), corners.max(0)
     margin = 0.005 * (high - low)
     return np.array([[*(low - margin)[:2], -1.0], [*(high + margin)[:2], 1.0]])
-
-
-def _common_field_of_view(cameras: Sequence[Camera]) -> tuple[float, float]:
-    across = min(0.5 * camera.width / camera.intrinsics["fx"] for camera in cameras)
-    down = min(0.5 * camera.height / camera.intrinsics["fy"] for camera in cameras)
-    return float(across), float(down)

@@ -24,7 +24,9 @@ def choose(motion: np.ndarray, sharpness: np.ndarray, count: int) -> list[str]:
 
     Time does not count: a camera that stands gives one frame, and frames may come at any rate. Of equally sharp frames the first is chosen.
     """
-    useful = _discounted(motion, sharpness)
+    usual = np.array([np.median(sharpness[max(0, frame - AROUND) : frame + AROUND + 1]) for frame in range(len(motion))])
+    counts = np.clip(sharpness / np.maximum(usual, 1e-9), 0.0, 1.0) ** DISCOUNT
+    useful = np.concatenate([[0.0], np.cumsum(np.diff(motion) * np.minimum(counts[1:], counts[:-1]))])  # from and to blurred frames less
     windows = max(1, min(count, 1 + int(useful[-1] / ALIKE)))
     chosen = _sharpest(motion, useful, sharpness, windows)
     blurred = _blurred(sharpness, chosen)
@@ -38,13 +40,6 @@ def choose(motion: np.ndarray, sharpness: np.ndarray, count: int) -> list[str]:
         else:
             verdicts.append(SAME if np.abs(motion[kept] - motion[frame]).min() < ALIKE else LESS_SHARP)
     return verdicts
-
-
-def _discounted(motion: np.ndarray, sharpness: np.ndarray) -> np.ndarray:
-    """(F,) motion from the first frame on, that from and to blurred frames counted less."""
-    usual = np.array([np.median(sharpness[max(0, frame - AROUND) : frame + AROUND + 1]) for frame in range(len(motion))])
-    counts = np.clip(sharpness / np.maximum(usual, 1e-9), 0.0, 1.0) ** DISCOUNT
-    return np.concatenate([[0.0], np.cumsum(np.diff(motion) * np.minimum(counts[1:], counts[:-1]))])
 
 
 def _sharpest(motion: np.ndarray, useful: np.ndarray, sharpness: np.ndarray, windows: int) -> list[int]:

@@ -22,7 +22,3 @@ class GradientBuffer:
             self.values = torch.zeros_like(table)
         self.filled = True
         return self.values
-
-    def mark_cleared(self) -> None:
-        """The optimiser has set the values to zero."""
-        self.filled = False

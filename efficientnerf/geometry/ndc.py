@@ -19,7 +19,7 @@ R rays, N points.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -69,10 +69,6 @@ class Ndc:
     def slopes(self) -> tuple[float, float]:
         """x' and y' of a point one unit to the side at a distance of one unit."""
         return 2 * self.focal / self.width, 2 * self.focal / self.height
-
-    def scaled_xy(self, factor: float) -> Ndc:
-        """The reference camera whose x' and y' are `factor` times these."""
-        return replace(self, width=self.width / factor, height=self.height / factor)
 
     def to_json(self) -> dict[str, Any]:
         return {"world_from_camera": self.world_from_camera.tolist(), **{name: float(getattr(self, name)) for name in NUMBERS}}

@@ -18,7 +18,7 @@ R rays, N points.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, NamedTuple
 
@@ -202,7 +202,8 @@ class NdcSpace(BoundedSpace):
         Grid coordinates are the same in both. So are lengths along z', which rays nearly run along, and with them densities; what slanted rays meet
         more of is left to the refinement.
         """
-        return NdcSpace(np.asarray(self.bounds, np.float64) * (depth, depth, 1.0), self.frame.scaled_xy(depth))
+        frame = replace(self.frame, width=self.frame.width / depth, height=self.frame.height / depth)
+        return NdcSpace(np.asarray(self.bounds, np.float64) * (depth, depth, 1.0), frame)
 
 
 Space = BoundedSpace | ContractedSpace | NdcSpace

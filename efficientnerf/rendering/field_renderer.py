@@ -106,10 +106,12 @@ class FieldRenderer:
         for origins, directions, slant, beyond, outputs in self._blocks(camera, progress):
             intervals = outputs.coarse.tried if m.space.contracted else len(origins) * (self.far - self.near) / m.step
             counts += SampleCounts(len(origins), intervals, valid_count(m, outputs), int(outputs.pivotal.sum()), len(outputs.fine.start))
-            found = [*split_by_box(slant, outputs, beyond, split), opacity_within(outputs, around)]
+            ray, middle = outputs.fine_ray, outputs.fine_middle
+            found = [*split_by_box(slant, outputs, beyond, split), outputs.opacity_of(middle <= crossings(outputs, around)[1][ray], ray)]
             if limits is not None:
                 stated = limits(*(a.double().cpu().numpy() for a in (origins, directions, found[2] / slant)))
-                found.append(opacity_nearer(outputs, torch.as_tensor(stated, dtype=torch.float32, device=m.device)))
+                nearest = torch.as_tensor(stated, dtype=torch.float32, device=m.device)
+                found.append(outputs.opacity_of(outputs.rays.world_distance(middle, ray) < nearest[ray], ray))
             parts.append([part.cpu().numpy() for part in found])
         shape = (camera.height, camera.width)
         columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
@@ -137,18 +139,6 @@ def crossings(outputs: RayOutputs, box: Box) -> tuple[Tensor, Tensor]:
     enter, leave = box.intersect(outputs.rays.origins, outputs.rays.directions)
     misses = leave <= torch.clamp(enter, min=0)
     return torch.where(misses, -torch.inf, enter), torch.where(misses, -torch.inf, leave)
-
-
-def opacity_within(outputs: RayOutputs, box: Box) -> Tensor:
-    """Opacity (R,) of all that lies before a ray leaves a box; 0 where it misses it."""
-    ray = outputs.fine_ray
-    return outputs.opacity_of(outputs.fine_middle <= crossings(outputs, box)[1][ray], ray)
-
-
-def opacity_nearer(outputs: RayOutputs, limits: Tensor) -> Tensor:
-    """Opacity (R,) of the samples whose middle is nearer than the limits (R,), distances of the world."""
-    ray = outputs.fine_ray
-    return outputs.opacity_of(outputs.rays.world_distance(outputs.fine_middle, ray) < limits[ray], ray)
 
 
 def split_by_box(slant: Tensor, outputs: RayOutputs, behind: Tensor, box: Box) -> tuple[Tensor, ...]:

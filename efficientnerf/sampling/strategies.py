@@ -125,7 +125,10 @@ class _ImportanceSampled:
 
     def fine(self, request: SamplingRequest, coarse: CoarseStage, weight: Tensor) -> tuple[Tensor, Samples]:
         pivotal = dispatch.select_pivots(weight, coarse.samples.first, self.pivotal_threshold, self.max_pivots)
-        quantile = _quantiles(len(request.offset), self.num_importance_samples, request.rng, request.offset.device)
+        shape = len(request.offset), self.num_importance_samples
+        within = torch.full(shape, 0.5) if request.rng is None else torch.from_numpy(request.rng.random(shape, np.float32))
+        # One in each of as many equal parts of [0, 1]: random in training, the middles in rendering.
+        quantile = to_device((torch.arange(shape[1]) + within) / shape[1], request.offset.device)
         distance = distances_at(coarse.samples, request.offset) if coarse.distance is None else coarse.distance
         capacity = None if request.capacity is None else request.capacity.fine
         rays = (request.rays.origins, request.rays.directions)
@@ -171,12 +174,6 @@ Strategy = Efficient | Valid | Hierarchical | Uniform
 def distances_at(samples: Samples, offset: Tensor) -> Tensor:
     """(N,) distances of samples that lie at `offset` (R,) in their intervals."""
     return samples.start + offset[ray_of_sample(samples.first, len(samples.start))] * samples.extent
-
-
-def _quantiles(rays: int, count: int, rng: np.random.Generator | None, device: torch.device) -> Tensor:
-    """(rays, count), one in each of `count` equal parts of [0, 1]: random in training, the middles in rendering."""
-    within = torch.full((rays, count), 0.5) if rng is None else torch.from_numpy(rng.random((rays, count), np.float32))
-    return to_device((torch.arange(count) + within) / count, device)
 
 
 def _random_mask(count: int, fraction: float, rng: np.random.Generator, device: torch.device) -> Tensor:

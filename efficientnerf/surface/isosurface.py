@@ -151,7 +151,8 @@ def isosurface(
         low = number * block - 1
         high = np.minimum(low + block, grid)  # the last sample, included
         margin = 0 if fusion is None else MARGIN
-        opacity = _opacity(_filled_block(volume, low - margin, high + 1 + margin, threshold, enclosed), threshold)
+        sigma = _filled_block(volume, low - margin, high + 1 + margin, threshold, enclosed).astype(np.float64)
+        opacity = (1 - np.exp2(-sigma / threshold)).astype(np.float32)  # of a layer that is half opaque at the threshold
         if opacity.max() <= EMPTY:  # nothing is fused there
             continue
         if fusion is not None:
@@ -177,11 +178,6 @@ def isosurface(
     # Sample i lies at the middle of voxel i. The lids at the boundary must not stand out of the box.
     grid_points = np.clip(grid_points + 0.5, 0, grid)
     return volume.tree.bounds_min + grid_points * volume.tree.voxel, triangles
-
-
-def _opacity(sigma: np.ndarray, threshold: float) -> np.ndarray:
-    """Density -> float32 opacity of a layer that is half opaque at the threshold."""
-    return (1 - np.exp2(-sigma.astype(np.float64) / threshold)).astype(np.float32)
 
 
 def _clipped(volume: Volume, opacity: np.ndarray, low: np.ndarray) -> np.ndarray:

@@ -97,23 +97,17 @@ def state_of(t: Trainer) -> dict[str, Tensor]:
 def restore(t: Trainer, state: dict[str, Tensor]) -> None:
     """Put `state_of`'s tensors back; ValueError names what does not fit, and then nothing has changed."""
     own = state_of(t)
-    step, samples_per_ray = _check(own, state)
-    for name, tensor in own.items():
-        tensor.copy_(state[name])  # in the memory of what is trained
-    t.step, t.samples_per_ray = step, samples_per_ray
-
-
-def _check(wanted: dict[str, Tensor], state: dict[str, Tensor]) -> tuple[int, float]:
-    """The step and the samples on a ray of a state; ValueError where a tensor is missing, unknown or of another type or shape, or a number impossible."""
-    models.check_tensors(state, wanted)
-    if unknown := sorted(state.keys() - wanted.keys()):
+    models.check_tensors(state, own)
+    if unknown := sorted(state.keys() - own.keys()):
         raise ValueError(f"tensor '{unknown[0]}' is of no part of the model")
     step, samples_per_ray = (float(number) for number in state["progress"])
     if not (1 <= step <= MAX_STEPS and step == int(step)):
         raise ValueError(f"step {step:g} is not from 1 to {MAX_STEPS}")
     if not (math.isfinite(samples_per_ray) and samples_per_ray > 0):
         raise ValueError(f"{samples_per_ray:g} samples on a ray")
-    return int(step), samples_per_ray
+    for name, tensor in own.items():
+        tensor.copy_(state[name])  # in the memory of what is trained
+    t.step, t.samples_per_ray = int(step), samples_per_ray
 
 
 def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = None, *, readback: AsyncReadback | None = None) -> Iterator[Progress]:

@@ -72,4 +72,4 @@ class Adam:
                 if grad is p.grad:
                     p.grad = None
                 else:
-                    group.buffers[name].mark_cleared()
+                    group.buffers[name].filled = False

@@ -75,19 +75,17 @@ class AsyncReadback:
         self.pending.append(to_host_async(numbers))
         self.steps += 1
         while len(self.pending) > (0 if self.steps < self.exact_steps else self.lag):
-            self._take(*self.pending.popleft())
+            arrived_numbers, arrived = self.pending.popleft()
+            if arrived is not None:
+                arrived.synchronize()
+            loss, *counts = arrived_numbers.tolist()
+            *counts, rays, coarse_complete, complete = (int(n) for n in counts)
+            self.known = StepCounts._make([loss, *counts, rays - complete])
+            share = 1.0 if self.valid_per_ray == self.fine_per_ray == 0 else 0.1
+            # Samples that did not fit are not counted: these are means over the rays whose samples did.
+            self.valid_per_ray += share * (self.known.valid / max(coarse_complete, 1) - self.valid_per_ray)
+            self.fine_per_ray += share * (self.known.fine / max(complete, 1) - self.fine_per_ray)
         return self.known
-
-    def _take(self, numbers: Tensor, arrived: Any) -> None:
-        if arrived is not None:
-            arrived.synchronize()
-        loss, *counts = numbers.tolist()
-        *counts, rays, coarse_complete, complete = (int(n) for n in counts)
-        self.known = StepCounts._make([loss, *counts, rays - complete])
-        share = 1.0 if self.valid_per_ray == self.fine_per_ray == 0 else 0.1
-        # Samples that did not fit are not counted: these are means over the rays whose samples did.
-        self.valid_per_ray += share * (self.known.valid / max(coarse_complete, 1) - self.valid_per_ray)
-        self.fine_per_ray += share * (self.known.fine / max(complete, 1) - self.fine_per_ray)
 
 
 class AsyncOccupancy:

@@ -150,10 +150,6 @@ def _full_shapes(name: str, meta: dict[str, Any], found: dict[str, Shape]) -> di
     return {"brick.density": (bricks, voxels), "brick.sh": (bricks, voxels, _harmonics_of(meta), 3)}
 
 
-def _full_stored(name: str, meta: dict[str, Any], raw: Tensors) -> np.ndarray:
-    return np.ones(raw["brick.density"].shape, bool)
-
-
 def _full_values(name: str, meta: dict[str, Any], raw: Tensors, count: int) -> tuple[np.ndarray, np.ndarray]:
     every = {"voxel.density": raw["brick.density"].reshape(-1), "voxel.sh": raw["brick.sh"].reshape(count, _harmonics_of(meta), 3)}
     return _sparse_values(name, meta, every, count)
@@ -174,5 +170,8 @@ LAYOUTS = {
         {**dict.fromkeys(packed.STREAMS, ("U8",)), "density.table": ("F32",), "base.table": ("F32",), "sh.palette": ("F16",)},
         _packed_shapes, _masked, _compact_values, packed.unpacked, _claimed,
     ),
-    "full": Layout(1, {"brick.density": ("F16", "F32"), "brick.sh": ("F16", "F32")}, _full_shapes, _full_stored, _full_values),
+    "full": Layout(
+        1, {"brick.density": ("F16", "F32"), "brick.sh": ("F16", "F32")},
+        _full_shapes, lambda name, meta, raw: np.ones(raw["brick.density"].shape, bool), _full_values,
+    ),
 }  # fmt: skip

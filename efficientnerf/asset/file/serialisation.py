@@ -65,14 +65,9 @@ def most_voxels(size: int, writer: str, degree: int, cells: int, brick: int, *, 
     return max(0, int((size - fixed) / (bytes_per_voxel(writer, degree) + mask)))
 
 
-def _bricks(tree: NerfTree) -> np.ndarray:
-    """(B, b^3) voxel numbers or -1, bricks in the order of the file."""
-    return tree.voxel_index[bricks_of(tree)]
-
-
 def _mask(tree: NerfTree) -> np.ndarray:
     """64-bit words (B, ceil(b^3 / 64)): which voxels of each brick are stored."""
-    stored = _bricks(tree) >= 0
+    stored = tree.voxel_index[bricks_of(tree)] >= 0
     words = math.ceil(tree.brick**3 / 64)
     padded = np.zeros((len(stored), words * 64), bool)
     padded[:, : tree.brick**3] = stored
@@ -145,7 +140,7 @@ def _checked(tree: NerfTree) -> NerfTree:
 def _full(tree: NerfTree, dtype: str = "<f2") -> Written:
     """All voxels of each brick. Voxels that were not stored get density 0, and a mean of the stored harmonics of their brick, the nearer
     the more: colours are interpolated over stored voxels alone, so that grey ones would show at the rim."""
-    index, voxels, harmonics = _bricks(tree), tree.brick**3, tree.harmonics_count
+    index, voxels, harmonics = tree.voxel_index[bricks_of(tree)], tree.brick**3, tree.harmonics_count
     _checked(tree)
     stored = index >= 0
     limit = MAX_HALF if dtype == "<f2" else np.inf

@@ -111,7 +111,8 @@ class _Chain(torch.autograd.Function):
         rows = ROWS if x.device.type == "cpu" else DEVICE_ROWS
         for begin in range(0, len(x), rows):
             part = x[begin : begin + rows]
-            first = _padded(part, _rows(part), _round_up(inputs, COLUMN_STEP), precision)
+            padded = min(ROWS, _round_up(len(part), ROW_STEP)) if part.device.type == "cpu" else len(part)
+            first = _padded(part, padded, _round_up(inputs, COLUMN_STEP), precision)
             given, y = [], first
             for layer in range(layers):
                 y = torch.cat([y, first], dim=1) if layer == skip else y
@@ -143,7 +144,7 @@ class _Chain(torch.autograd.Function):
                 bias_grads[layer] += g.sum(0)  # summed in float32, and rounded once
                 if layer:
                     hidden = len(weights[layer - 1])  # what x adds at the skip needs no gradient
-                    g = _relu_backward(product(g, transposed[layer][:hidden], None, False), y[:, :hidden])
+                    g = torch.ops.aten.threshold_backward(product(g, transposed[layer][:hidden], None, False), y[:, :hidden], 0)
                 elif x_grad is not None:
                     x_grad[begin : begin + ctx.rows] = product(g, transposed[0], None, False)[: len(part), :inputs]
         ctx.activations = None
@@ -153,10 +154,6 @@ class _Chain(torch.autograd.Function):
 
 def _round_up(count: int, step: int) -> int:
     return -(-count // step) * step
-
-
-def _rows(part: Tensor) -> int:
-    return min(ROWS, _round_up(len(part), ROW_STEP)) if part.device.type == "cpu" else len(part)
 
 
 def _padded(x: Tensor, rows: int, columns: int, precision: torch.dtype) -> Tensor:
@@ -183,8 +180,3 @@ def _unpadded(grad: Tensor, shape: torch.Size, split: int | None) -> Tensor:
         return grad[: shape[0], : shape[1]]
     after = _round_up(split, COLUMN_STEP)
     return torch.cat([grad[: shape[0], :split], grad[: shape[0], after : after + shape[1] - split]], dim=1)
-
-
-def _relu_backward(grad: Tensor, out: Tensor) -> Tensor:
-    """The gradient before a ReLU that gave `out`."""
-    return torch.ops.aten.threshold_backward(grad, out, 0)

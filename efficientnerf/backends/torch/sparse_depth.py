@@ -19,21 +19,17 @@ def sparse_depth_errors(weight: Tensor, start: Tensor, extent: Tensor, first: Te
     width                  extents on either side of a point that count as at it
     """
     count = len(distance)
-    start, extent, weight, ray = _of_last(start, extent, weight, first, len(first) - 1 - count)
+    before = len(first) - 1 - count
+    if transfer.is_on_device(first):  # whose host would wait for the number of the last rays' samples: the others get a weight of zero
+        ray = ray_of_sample(first, len(start)) - before
+        weight, ray = torch.where(ray >= 0, weight, 0), ray.clamp(min=0)
+    else:
+        begin = int(first[before])
+        start, extent, weight = start[begin:], extent[begin:], weight[begin:]
+        ray = ray_of_sample(first[before:] - begin, len(start))
     past = (start + extent / 2 - distance[ray]) / (width * extent).clamp(min=1e-12)
     zero = weight.new_zeros(count)
     near = zero.index_add(0, ray, weight * (1 - past.abs()).clamp(min=0))
     reaching, ending = 1 - zero.index_add(0, ray, weight * (past <= -1)), zero.index_add(0, ray, weight * (past.abs() < 1))
     passing = reaching.detach().clamp(min=0) * (1 - ending / reaching.clamp(min=LEAST_LIGHT))
     return torch.where(on_support, passing, 1 - near)
-
-
-def _of_last(start: Tensor, extent: Tensor, weight: Tensor, first: Tensor, before: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Starts, extents and weights of the samples of all rays but the first `before`, and their rays, from 0. On a device, whose host would wait for their
-    number, those of all rays, the others with a weight of zero."""
-    if transfer.is_on_device(first):
-        ray = ray_of_sample(first, len(start)) - before
-        return start, extent, torch.where(ray >= 0, weight, 0), ray.clamp(min=0)
-    begin = int(first[before])
-    ray = ray_of_sample(first[before:] - begin, len(start) - begin)
-    return start[begin:], extent[begin:], weight[begin:], ray

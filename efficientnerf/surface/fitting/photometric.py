@@ -60,7 +60,8 @@ def refined(vertices: np.ndarray, faces: np.ndarray, photographs: Iterable[Photo
         photo = photo.reduced(MAX_PIXELS)
         cameras.append(photo.camera)
         grades.append(shown_vertices(vertices, faces, normals, photo, tick))
-        greys.append(_grey(photo.colours))
+        red, green, blue = np.moveaxis(photo.colours.astype(np.uint32), -1, 0)
+        greys.append(((77 * red + 150 * green + 29 * blue + 128) >> 8).astype(np.uint8))  # luma (ITU-R BT.601)
     unmoved = PhotometricRefinement(vertices, 0.0, 0.0, 0.0, False)
     if len(cameras) < 3:
         return unmoved
@@ -76,11 +77,6 @@ def refined(vertices: np.ndarray, faces: np.ndarray, photographs: Iterable[Photo
     means = [float((each * weight).sum() / max(weight.sum(), 1e-12)) for each in (before, after)]
     improved = means[1] > means[0]
     return PhotometricRefinement(moved if improved else vertices, float(seen.mean()), means[0], means[1], improved)
-
-
-def _grey(colours: np.ndarray) -> np.ndarray:
-    """(H, W) uint8 luma (ITU-R BT.601) of (H, W, 3) uint8."""
-    return np.asarray(((77 * colours[..., 0].astype(np.uint32) + 150 * colours[..., 1] + 29 * colours[..., 2] + 128) >> 8).astype(np.uint8))
 
 
 @dataclass(eq=False)

@@ -36,7 +36,22 @@ class Atlas:
     @cached_property
     def texels(self) -> Texels:
         """Those whose centres lie in a face, by face."""
-        return _texels(self)
+        owner = np.full((self.size, self.size), -1, np.int32)
+        corners = np.ascontiguousarray(self.corners)
+        for part in pieces(len(corners), first=4096):
+            lay_faces(corners, part.start, part.stop, owner)
+        _give_each_a_texel(corners, owner)
+        place = np.flatnonzero(owner.ravel() >= 0)
+        face = owner.ravel()[place]
+        order = np.argsort(face, kind="stable")
+        place, face = place[order], face[order].astype(np.int64)
+        begin = np.searchsorted(face, np.arange(len(self.corners) + 1))
+        x, y = self.corners[face, :, 0] - (place % self.size + 0.5)[:, None], self.corners[face, :, 1] - (place // self.size + 0.5)[:, None]
+        a, b = x[:, 1] * y[:, 2] - x[:, 2] * y[:, 1], x[:, 2] * y[:, 0] - x[:, 0] * y[:, 2]
+        c = x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]
+        share, total = np.stack([a, b, c], 1), (a + b + c)[:, None]
+        share = np.clip(np.divide(share, total, out=np.full_like(share, 1 / 3), where=total != 0), 0, 1)  # a texel that was given may lie outside of its face
+        return Texels(place, begin, np.asarray(share / share.sum(1, keepdims=True), np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,25 +126,6 @@ def _packed(charts: Charts, scale: float, size: int) -> np.ndarray | None:
         if not pack(by_height[part], first, bottom, top, step, horizon, places):
             return None
     return np.asarray(corners + gap + 0.5 + places[charts.chart][:, None])
-
-
-def _texels(atlas: Atlas) -> Texels:
-    owner = np.full((atlas.size, atlas.size), -1, np.int32)
-    corners = np.ascontiguousarray(atlas.corners)
-    for part in pieces(len(corners), first=4096):
-        lay_faces(corners, part.start, part.stop, owner)
-    _give_each_a_texel(corners, owner)
-    place = np.flatnonzero(owner.ravel() >= 0)
-    face = owner.ravel()[place]
-    order = np.argsort(face, kind="stable")
-    place, face = place[order], face[order].astype(np.int64)
-    begin = np.searchsorted(face, np.arange(len(atlas.corners) + 1))
-    x, y = atlas.corners[face, :, 0] - (place % atlas.size + 0.5)[:, None], atlas.corners[face, :, 1] - (place // atlas.size + 0.5)[:, None]
-    a, b = x[:, 1] * y[:, 2] - x[:, 2] * y[:, 1], x[:, 2] * y[:, 0] - x[:, 0] * y[:, 2]
-    c = x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]
-    share, total = np.stack([a, b, c], 1), (a + b + c)[:, None]
-    share = np.clip(np.divide(share, total, out=np.full_like(share, 1 / 3), where=total != 0), 0, 1)  # a texel that was given may lie outside of its face
-    return Texels(place, begin, np.asarray(share / share.sum(1, keepdims=True), np.float32))
 
 
 def _give_each_a_texel(corners: np.ndarray, owner: np.ndarray) -> None:

@@ -208,7 +208,8 @@ def _seen(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, photo: P
     image: MeshImage = mesh_image(vertices, faces, photo.camera)
     near = (np.float32(1) / image.depth).astype(np.float32)
     clear = edge_distance(photo.usable, near, tick)
-    clear = np.minimum(clear, _from_border(near.shape) * (REACH / max(BORDER * max(near.shape), REACH)))
+    row, column = (np.minimum(np.arange(side, dtype=np.float32), np.arange(side, dtype=np.float32)[::-1]) for side in near.shape)  # pixels from a border
+    clear = np.minimum(clear, np.minimum(row[:, None], column) * (REACH / max(BORDER * max(near.shape), REACH)))
     pixels, depth = project(photo.camera, vertices)
     away = photo.camera.centre - vertices
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-300)
@@ -227,12 +228,6 @@ def edge_distance(usable: np.ndarray, near: np.ndarray, tick: Callable[[], None]
             tick()
             sweep_down(part.start, part.stop, image)
     return clear
-
-
-def _from_border(shape: tuple[int, ...]) -> np.ndarray:
-    """(H, W) float32 pixels from the nearest border."""
-    row, column = np.arange(shape[0], dtype=np.float32), np.arange(shape[1], dtype=np.float32)
-    return np.minimum(np.minimum(row, row[::-1])[:, None], np.minimum(column, column[::-1]))
 
 
 @dataclass(eq=False)
