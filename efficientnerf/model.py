@@ -222,7 +222,8 @@ def render_rays(
     coarse = stage.samples
     coarse_raw, coarse_out = _composited(m, m.coarse, directions, coarse, behind)
     pivotal, fine = m.strategy.fine(request, stage, coarse_out.weight.detach())
-    if prune and rng is not None and capacity is None and isinstance(m.strategy, Efficient):  # on a device the number of samples is not known
+    # On a device samples are padded to numbers that those of earlier steps decide.
+    if prune and rng is not None and isinstance(m.strategy, Efficient) and not dispatch.on_device(m.voxels.values):
         fine = _visible(m, fine)
     fine_raw, out = _composited(m, m.fine, directions, fine, behind)
     out = out._replace(distortion=out.distortion + coarse_out.distortion)
