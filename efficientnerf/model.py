@@ -233,7 +233,7 @@ def render_rays(
 @torch.no_grad()
 def _visible(m: Model, fine: Samples) -> Samples:
     """The fine samples that are not behind what the fine field has: two in three are, for the coarse field is less sharp, and nothing is learned from them."""
-    return dispatch.visible_samples(fine, m.fine.density(m.snapped_points(fine.point)), m.fine.activation, HIDDEN)
+    return dispatch.visible_samples(fine, lambda points: m.fine.density(m.snapped_points(points)), m.fine.activation, HIDDEN)
 
 
 def _composited(m: Model, field: Field, directions: Tensor, samples: Samples, behind: Tensor) -> tuple[Tensor, Composite]:

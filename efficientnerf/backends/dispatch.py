@@ -151,9 +151,9 @@ def pivotal_samples(
     return divide(space, origins, directions, offset, coarse, pivotal, per_pivot, **_capacity(backend, capacity))
 
 
-def visible_samples(samples: Samples, raw: Tensor, activation: str, least: float) -> Samples:
+def visible_samples(samples: Samples, density: Callable[[Tensor], Tensor], activation: str, least: float) -> Samples:
     """See `efficientnerf.sampling.visible.visible_samples`."""
-    return implementation("visible_samples", backend_of(raw))(samples, raw, activation, least)
+    return implementation("visible_samples", backend_of(samples.start))(samples, density, activation, least)
 
 
 def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, activation: str) -> Composite:

@@ -1,6 +1,7 @@
 """Samples that a ray reaches, in plain torch. N samples."""
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -9,13 +10,13 @@ from efficientnerf.rendering.compositing import activate, ray_of_sample
 from efficientnerf.sampling.samples import Samples
 
 
-def visible_samples(samples: Samples, raw: Tensor, activation: str, least: float) -> Samples:
+def visible_samples(samples: Samples, density: Callable[[Tensor], Tensor], activation: str, least: float) -> Samples:
     """The samples before which more than `least` of their ray's light is left: the first ones of each ray.
 
-    raw  (N,) density before its activation
+    density  of points (N, 3): (N,), before its activation
     """
-    ray = ray_of_sample(samples.first, len(raw))
-    depth = activate(raw, activation).double() * samples.length
+    ray = ray_of_sample(samples.first, len(samples.start))
+    depth = activate(density(samples.point), activation).double() * samples.length
     before = torch.cumsum(depth, dim=0) - depth
     begins = torch.cat([before, before.new_zeros(1)])[samples.first[:-1]]  # of a ray without samples, whatever lies there
     visible = before - begins[ray] < -math.log(least)

@@ -1,6 +1,6 @@
 """The numba kernels as operations on float32 tensors of the CPU: the functions that `efficientnerf.backends.dispatch` calls."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -52,9 +52,9 @@ def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: T
     return Samples._make([*(torch.from_numpy(a) for a in fine), coarse.tried, None])
 
 
-def visible_samples(samples: Samples, raw: Tensor, activation: str, least: float) -> Samples:
+def visible_samples(samples: Samples, density: Callable[[Tensor], Tensor], activation: str, least: float) -> Samples:
     columns = SampleColumns(*map(_array, samples[1:5]))
-    found = sampling.visible_samples(_array(samples.first), columns, _array(raw), activation == "exp", least)
+    found = sampling.visible_samples(_array(samples.first), columns, lambda points: _array(density(torch.from_numpy(points))), activation == "exp", least)
     return Samples._make([*(torch.from_numpy(a) for a in found), samples.tried, None])
 
 

@@ -6,6 +6,7 @@ on the number of threads.
 R rays, N samples, D density voxels a side. In unit coordinates a space's box is [-1, 1]^3.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from efficientnerf.geometry.spaces import FARTHEST
 
 BLOCK = 64  # rays per task
 LANES = 16  # rays that are marched at once
+LOOKED_AT = 4, 12, 2**62  # numbers of a ray's samples up to which densities are asked for at a time
 # Rows of the state, (ROWS, LANES) float32: origin and direction in unit coordinates; distance along the ray, and where the ray leaves the space; offset of a
 # sample in its interval; threshold of the density voxels; number of intervals visited; start of the last of them.
 UX, UY, UZ, VX, VY, VZ, T, T_EXIT, OFFSET, THRESHOLD, VISITED, START, ROWS = range(13)
@@ -245,16 +247,27 @@ def pivotal_samples(bundle: RayBundle, box: Box, first: np.ndarray, coarse: Samp
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def _count_visible(raw, length, first, exponential, deepest, counts):
-    """Writes how many samples of each ray lie before the optical depth `deepest`."""
-    rays = len(counts)
+def _gather_points(point, first, begin, rows, out):
+    """The points of samples of each ray from number `begin` on, as many as `rows` (R + 1,) says, end to end."""
+    rays = len(rows) - 1
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):
         for r in range(block * BLOCK, min(rays, (block + 1) * BLOCK)):
-            n, depth = first[r], np.float32(0)
-            while n < first[r + 1] and depth < deepest:
-                depth += activate_density(raw[n], exponential)[0] * length[n]
+            ahead = first[r] + begin - rows[r]
+            for n in range(rows[r], rows[r + 1]):
+                out[n, 0], out[n, 1], out[n, 2] = point[ahead + n, 0], point[ahead + n, 1], point[ahead + n, 2]
+
+
+@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
+def _absorb(raw, length, first, begin, rows, exponential, deepest, depth, counts):
+    """Adds to the optical depth of each ray that of these samples, up to `deepest`, and to `counts` how many begin before it."""
+    rays = len(rows) - 1
+    for block in numba.prange((rays + BLOCK - 1) // BLOCK):
+        for r in range(block * BLOCK, min(rays, (block + 1) * BLOCK)):
+            n, ahead = rows[r], first[r] + begin - rows[r]
+            while n < rows[r + 1] and depth[r] < deepest:
+                depth[r] += activate_density(raw[n], exponential)[0] * length[ahead + n]
                 n += 1
-            counts[r] = n - first[r]
+            counts[r] += n - rows[r]
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
@@ -270,10 +283,20 @@ def _write_first(first, columns, kept, start, extent, length, point):
                 point[n, 0], point[n, 1], point[n, 2] = old_point[back + n, 0], old_point[back + n, 1], old_point[back + n, 2]
 
 
-def visible_samples(first: np.ndarray, columns: SampleColumns, raw: np.ndarray, exponential: bool, least: float) -> tuple[np.ndarray, ...]:
-    """`efficientnerf.sampling.visible.visible_samples` on arrays: (first, start, extent, length, point)."""
-    counts = np.empty(len(first) - 1, np.int64)
-    _count_visible(raw, columns.length, first, exponential, np.float32(-np.log(least)), counts)
+def visible_samples(
+    first: np.ndarray, columns: SampleColumns, density: Callable[[np.ndarray], np.ndarray], exponential: bool, least: float
+) -> tuple[np.ndarray, ...]:
+    """`efficientnerf.sampling.visible.visible_samples` on arrays: (first, start, extent, length, point). Most rays end at their first samples: the densities of
+    others are asked for where these let light through."""
+    depth, counts = np.zeros(len(first) - 1, np.float32), np.zeros(len(first) - 1, np.int64)
+    deepest, begin = np.float32(-np.log(least)), 0
+    for end in LOOKED_AT:
+        ahead = np.where(depth < deepest, np.clip(np.diff(first), begin, end) - begin, 0)
+        rows = np.concatenate([np.zeros(1, np.int64), np.cumsum(ahead)])
+        points = np.empty((int(rows[-1]), 3), np.float32)
+        _gather_points(columns.point, first, begin, rows, points)
+        _absorb(density(points), columns.length, first, begin, rows, exponential, deepest, depth, counts)
+        begin = end
     kept = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
     n = int(kept[-1])
     out = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32), np.empty((n, 3), np.float32)

@@ -112,27 +112,27 @@ def buffer_for(table: Tensor) -> GradientBuffer:
 
 
 def visible_samples_case(activation: str) -> Case:
-    """Rays of no sample, of one, and of some that are hidden and none that is."""
+    """Rays of no sample, of one, and of some that are hidden and none that is; densities depend on the point."""
     counts, least = [0, 1, 9, 40, 0, 6], 1e-2
     draw = np.random.default_rng(7)
     columns = {name: torch.from_numpy(draw.random(size).astype(np.float32)) for name, size in (("start", 56), ("extent", 56), ("point", (56, 3)))}
-    inputs = {"length": torch.from_numpy(draw.uniform(0.1, 0.3, 56).astype(np.float32)), "raw": torch.from_numpy(draw.normal(size=56).astype(np.float32))}
+    inputs = {"first": torch.tensor([0, *np.cumsum(counts)]), "length": torch.from_numpy(draw.uniform(0.1, 0.3, 56).astype(np.float32)), **columns}
 
-    def call(visible_samples: Operation, first: Tensor, raw: Tensor, **columns: Tensor) -> list[Tensor]:
-        return list(visible_samples(Samples(first=first, **columns, tried=0), raw, activation, least)[:5])  # type: ignore[arg-type]
+    def call(visible_samples: Operation, **columns: Tensor) -> list[Tensor]:
+        return list(visible_samples(Samples(**columns, tried=0), lambda points: 6 * points[:, 0] - 3, activation, least)[:5])  # type: ignore[arg-type]
 
-    def loop(first: np.ndarray, raw: np.ndarray, **columns: np.ndarray) -> list[np.ndarray]:
+    def loop(first: np.ndarray, **columns: np.ndarray) -> list[np.ndarray]:
         kept, ends = [], [0]
         for begin, end in itertools.pairwise(first):
             left = 1.0
             for n in range(begin, end):
                 if left > least:
                     kept.append(n)
-                left *= math.exp(-reference.activate(raw[n], activation) * columns["length"][n])
+                left *= math.exp(-reference.activate(6 * columns["point"][n, 0] - 3, activation) * columns["length"][n])
             ends.append(len(kept))
         return [np.array(ends), *(columns[name][kept] for name in ("start", "extent", "length", "point"))]
 
-    return Case(call, loop, {"first": torch.tensor([0, *np.cumsum(counts)]), **inputs, **columns})
+    return Case(call, loop, inputs)
 
 
 def composite_case(activation: str, degree: int) -> Case:
