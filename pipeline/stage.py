@@ -238,6 +238,8 @@ def _near(hint: Any, value: Any) -> str:
 def _shown(value: Any) -> str:
     try:
         text = f"{value!r} ({type(value).__name__})" if value is not None else "none"
-    except (ValueError, RecursionError):  # of a number of thousands of digits; of a value nested too deeply
-        text = f"a value that is too long ({type(value).__name__})"
+    except RecursionError:
+        text = f"a value that nests too deeply ({type(value).__name__})"
+    except ValueError:  # of more than 4300 digits
+        text = f"a number that is too long ({type(value).__name__})"
     return text if len(text) <= 80 else text[:77] + "..."

@@ -51,11 +51,11 @@ def update_at_random_cells(m: Model, number: int, rng: np.random.Generator) -> N
     update_at_cells(m, cell, point)
 
 
-def update_at_cells(m: Model, cell: Tensor, point: Tensor) -> None:
-    """Query the coarse field at points (N, 3) in some voxels (N,), BLOCK at a time."""
-    for begin in range(0, len(cell), BLOCK):
-        part = point[begin : begin + BLOCK]
-        update_at_points(m, part, m.coarse.density(m.snapped_points(part)), cell[begin : begin + BLOCK])
+def update_at_cells(m: Model, cell: Tensor, point: Tensor, block: int = BLOCK) -> None:
+    """Query the coarse field at points (N, 3) in some voxels (N,), `block` at a time."""
+    for begin in range(0, len(cell), block):
+        part = point[begin : begin + block]
+        update_at_points(m, part, m.coarse.density(m.snapped_points(part)), cell[begin : begin + block])
 
 
 def update_at_points(m: Model, point: Tensor, raw: Tensor, cell: Tensor | None = None, count: Tensor | None = None) -> None:

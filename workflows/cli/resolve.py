@@ -143,8 +143,10 @@ def text_of(value: Any, limit: int = MAX_SHOWN) -> str:
     """A value as a message shows it; Python writes out no number of more than 4300 digits, and nothing that nests deeply."""
     try:
         return printable(repr(value), limit)
-    except (ValueError, RecursionError):
-        return "a value that is too long"
+    except RecursionError:
+        return "a value that nests too deeply"
+    except ValueError:
+        return "a number that is too long"
 
 
 def parse_value(text: str) -> list[Any]:

@@ -18,7 +18,7 @@ pytest.importorskip("distributed", reason="Dask distributed (the extra fleet) is
 
 def cluster(folder: Path, *, processes: bool) -> list[Any]:
     path = folder / "cluster.toml"
-    path.write_text(f"n_workers = 2\nprocesses = {str(processes).lower()}\n", encoding="utf-8")
+    path.write_text(f'n_workers = 2\nprocesses = {str(processes).lower()}\ndashboard_address = ":0"\n', encoding="utf-8")
     return ["--cluster", "local", "--cluster-options", path, "--json"]
 
 
