@@ -25,7 +25,7 @@ from stages.bake.refine.timing import Stopwatch
 from stages.bake.settings import refuse_nerf
 from stages.bake.values import baked_tree
 from stages.bake.voxels import Voxels, choose_voxels
-from stages.compiling import compiling_kernels
+from stages.compiling import running_kernels
 from stages.cores import count_cores, use_all_cores
 from stages.io import scene
 from stages.io.field_file import load_renderer
@@ -38,7 +38,7 @@ SIZE_NOTE = "size_limit.json"
 PSNR_BYTES = 16  # by which a header grows at most, once the PSNR of what is written is known
 
 
-@compiling_kernels
+@running_kernels
 def run(job: Job) -> None:
     stopwatch, settings, poses, train = Stopwatch(), job.settings, job.inputs["poses"], job.inputs["train"]
     use_all_cores()

@@ -120,7 +120,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=26,
+    version=27,
     settings=BakeSettings,
     needs=("poses", "train"),
     run=ByName("stages.bake.run:run"),

@@ -31,7 +31,7 @@ from efficientnerf.settings import resolved
 from pipeline.files import write_json
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, SplatsOutputs
-from stages.compiling import compiling_kernels
+from stages.compiling import running_kernels
 from stages.evaluate.asset import EvaluatedAsset, evaluated
 from stages.evaluate.comparison import Evaluation, evaluate_view, load_lpips
 from stages.evaluate.judging import judge, refinement_of, training_figures
@@ -60,7 +60,7 @@ VIDEO_LONGEST, VIDEO_FPS, VIDEO_CRF = 480, 15, 20  # of the captured path; pixel
 Measured = str | float | dict[str, int | float | list[float] | None] | None  # the name of a view, or its metrics
 
 
-@compiling_kernels
+@running_kernels
 def run(job: Job) -> None:
     bake, mesh, splats = BakeOutputs(job.inputs["bake"]), MeshOutputs(job.inputs["mesh"]), SplatsOutputs(job.inputs["splats"])
     tree = format.load(bake.asset).to(job.device)

@@ -20,7 +20,7 @@ from efficientnerf.capture.keying import large_parts
 from pipeline.errors import BadInput, UsageError
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
-from stages.compiling import compiling_kernels
+from stages.compiling import running_kernels
 from stages.cores import count_cores, in_order
 from stages.figures.plots import grid_sheet
 from stages.formats.importers.source import MIN_IMAGES, abbreviated
@@ -70,7 +70,7 @@ def with_foreground_masks(job: Job, capture: Capture, warn: Any) -> Capture:
     if made is None:
         found: list[_Made] = []
 
-        @compiling_kernels
+        @running_kernels
         def make(job: Job) -> None:
             refuse_what_does_not_fit(job, first_training_needed(len(images)), "Omit --mask foreground.")
             field = first_field(job, capture, images)

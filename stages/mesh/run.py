@@ -17,7 +17,7 @@ from pipeline.errors import UsageError
 from pipeline.files import write_json
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs, MeshOutputs
-from stages.compiling import compiling_kernels
+from stages.compiling import running_kernels
 from stages.figures.shading import IN_FRONT, render_sides
 from stages.formats.exporters import MESH_EXPORTERS
 from stages.formats.exporters.writing import SourceFrame, source_frame
@@ -153,7 +153,7 @@ def write_empty(outputs: MeshOutputs, mesh: Mesh, seen: list[AssetView], frame: 
     job.say("no faces", faces=0, components=0, watertight=False)
 
 
-@compiling_kernels
+@running_kernels
 def run(job: Job) -> None:
     outputs, settings, captured = MeshOutputs(job.out), job.settings, (job.inputs["poses"], job.inputs["train"])
     whole = load(BakeOutputs(job.inputs["bake"]).asset)

@@ -24,7 +24,7 @@ from pipeline.errors import StageFailed, UsageError
 from pipeline.files import write_json
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs, SplatsOutputs
-from stages.compiling import compiling_kernels
+from stages.compiling import running_kernels
 from stages.figures.plots import to_uint8
 from stages.formats.exporters import SPLAT_EXPORTERS
 from stages.formats.exporters.splats.frames import in_capture
@@ -81,7 +81,7 @@ def preview(tree: NerfTree, gaussians: Gaussians) -> np.ndarray:
     return to_uint8(np.clip(np.concatenate([own.colour, theirs.colour], axis=1), 0, 1))
 
 
-@compiling_kernels
+@running_kernels
 def run(job: Job) -> None:
     outputs, settings = SplatsOutputs(job.out), job.settings
     if settings.make == "off":

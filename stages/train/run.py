@@ -17,7 +17,7 @@ from efficientnerf.training.settings import TrainSettings
 from efficientnerf.training.sparse_depth import SparseDepthRays
 from pipeline.stage import Job
 from stages.artifacts import TrainOutputs
-from stages.compiling import clock, compiling_kernels
+from stages.compiling import clock, running_kernels
 from stages.cores import use_all_cores
 from stages.io import field_file, scene
 from stages.io.scene import Scene
@@ -34,7 +34,7 @@ from stages.train.previews import Previews
 from stages.train.priors import Prior, mask_uncovered_cells
 
 
-@compiling_kernels
+@running_kernels
 def run(job: Job) -> None:
     while not trained(job):
         pass

@@ -10,7 +10,7 @@ from efficientnerf.geometry.cameras import Camera
 from efficientnerf.settings import resolved
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs, TurntableOutputs
-from stages.compiling import compiling_kernels
+from stages.compiling import running_kernels
 from stages.figures.frames import RenderOptions, encode_frames, render_frames
 from stages.framing.restriction import restricted
 from stages.memory.need import refuse_what_does_not_fit
@@ -19,7 +19,7 @@ from stages.turntable.memory import frames_needed
 from stages.turntable.settings import TurntableSettings
 
 
-@compiling_kernels
+@running_kernels
 def run(job: Job) -> None:
     s: TurntableSettings = job.settings
     whole = format.load(BakeOutputs(job.inputs["bake"]).asset)
