@@ -15,16 +15,19 @@ _compilations: list[Compilation] = []  # of the stages that ran in this process
 def running_kernels(run: Callable[[Job], None]) -> Callable[[Job], None]:
     """A stage's `run` that tells the user when the first kernel is compiled rather than loaded, and in the end how long that took.
 
-    Denormal numbers are zero in it, in threads that start from then on too: densities and gradients of empty space are so small, and processors of Intel take
-    some hundred cycles for each product with one. It stays so in the process, so that all stages of a run compute alike.
+    Meanwhile denormal numbers are zero, for good in threads that it starts: densities and gradients of empty space are so small, and processors of Intel take
+    some hundred cycles for each product with one.
     """
 
     @functools.wraps(run)
     def reporting(job: Job) -> None:
         torch.set_flush_denormal(True)
-        with compilation(lambda: job.say("compiling kernels, once")) as found:
-            _compilations.append(found)
-            run(job)
+        try:
+            with compilation(lambda: job.say("compiling kernels, once")) as found:
+                _compilations.append(found)
+                run(job)
+        finally:
+            torch.set_flush_denormal(False)
         if found.functions:
             job.say(f"compiling kernels, once: {found.seconds:.0f} s", compile_seconds=found.seconds)
 
