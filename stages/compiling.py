@@ -15,8 +15,8 @@ _compilations: list[Compilation] = []  # of the stages that ran in this process
 def running_kernels(run: Callable[[Job], None]) -> Callable[[Job], None]:
     """A stage's `run` that tells the user when the first kernel is compiled rather than loaded, and in the end how long that took.
 
-    Meanwhile denormal numbers are zero, for good in threads that it starts: densities and gradients of empty space are so small, and processors of Intel take
-    some hundred cycles for each product with one.
+    Meanwhile denormal numbers are zero, for good in threads that it starts. Densities and gradients of empty space are so small, and an Intel Xeon took more
+    than twice as long for a training step with them. docs/experiments/first-minutes.md
     """
 
     @functools.wraps(run)
