@@ -71,7 +71,10 @@ def test_the_process_ends_with_the_run_and_leaves_nothing(tmp_path: Path, monkey
         assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.05)
-    assert os.getpriority(os.PRIO_PROCESS, process.pid) == min(os.getpriority(os.PRIO_PROCESS, 0) + 10, 19)
+    if hasattr(os, "SCHED_IDLE"):
+        assert os.sched_getscheduler(process.pid) == os.SCHED_IDLE
+    else:
+        assert os.getpriority(os.PRIO_PROCESS, process.pid) == min(os.getpriority(os.PRIO_PROCESS, 0) + 10, 19)
     process.stdin.close()
     try:
         assert process.wait(timeout=10) == 0

@@ -18,7 +18,7 @@ from workflows.asset import WORKFLOW
 from workflows.precompilation.scene import write_scene
 from workflows.precompilation.start import REQUEST, stamp_of
 
-NICE = 10  # it gives way to the run; not by so much that a kernel that the run waits for is never done
+NICE = 10  # where there is no SCHED_IDLE
 
 
 def precompile(settings: dict[str, dict[str, Any]], folder: Path) -> None:
@@ -27,6 +27,16 @@ def precompile(settings: dict[str, dict[str, Any]], folder: Path) -> None:
     run = Run.create(folder / "run", folder / "source", settings, device="cpu")
     run_stages(run, WORKFLOW.stages, device="cpu")
     stamp_of(settings).touch()
+
+
+def give_way() -> None:
+    """Run when a core has nothing else to do: threads of the run that wake many times a second then never wait for this process, as they do for one that is
+    only nice. docs/experiments/first-minutes.md"""
+    with contextlib.suppress(OSError, AttributeError):  # of systems that have none, and of sandboxes
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+        return
+    with contextlib.suppress(OSError, AttributeError):
+        os.nice(NICE)
 
 
 def _end_with_parent(folder: Path) -> None:
@@ -40,8 +50,7 @@ def _end_with_parent(folder: Path) -> None:
 
 def main() -> None:
     request = json.loads(os.environ[REQUEST])
-    if hasattr(os, "nice"):
-        os.nice(NICE)
+    give_way()
     with tempfile.TemporaryDirectory(prefix="efficientnerf-", ignore_cleanup_errors=True) as name:
         if not request["detached"]:
             threading.Thread(target=_end_with_parent, args=(Path(name),), daemon=True).start()

@@ -5,10 +5,10 @@ Threads: OpenMP; where numba's OpenMP pool cannot be loaded (no libgomp on Linux
 numba ends the process where two threads call kernels at once. The stages call kernels from one thread; a program that does not needs OpenMP
 or a lock of its own. NUMBA_THREADING_LAYER and NUMBA_THREADING_LAYER_PRIORITY, where set, hold.
 
-Cache: `kernel_cache.folder()`, for functions of this package alone. It only saves time: files in it that are damaged are removed and compiled again, and a
-disk that takes or gives no file is not an error. Both are said in a RuntimeWarning. Of several processes that need a form of a function at the same moment
-one compiles it, and the others wait for it and load it. Where sources of a form were changed since this process began, as by an upgrade, what it has read of
-them is not known, and the form is neither loaded nor kept.
+Cache: `kernel_cache.folder()`, for functions of this package alone. It only saves time: files in it that are damaged are removed and compiled again, and a disk
+that takes or gives no file is not an error. Both are said in a RuntimeWarning. Of several processes that need a form of a function at the same moment one
+compiles it, and the others wait for it, up to PATIENCE, and load it. Where sources of a form were changed since this process began, as by an upgrade, what it
+has read of them is not known, and the form is neither loaded nor kept.
 """
 
 from __future__ import annotations
@@ -88,6 +88,10 @@ def _warn_once(text: str) -> None:
     warnings.warn(text, Notice, stacklevel=2)
 
 
+PATIENCE = 20.0  # seconds to wait for a form that another process compiles: one that runs only on idle cores may wait for ever on a busy machine
+POLL = 0.02
+
+
 class ByteLocks:
     """Locks of processes, one for each text: bytes of one file, which the system frees when a process ends, however it does."""
 
@@ -96,15 +100,21 @@ class ByteLocks:
         self._held: set[int] = set()
 
     def take(self, text: str, *, wait: bool) -> bool:
-        """Whether the lock is held now, or cannot be had on this system; False where another process holds it and `wait` is off."""
+        """Whether the lock is held now, or cannot be had on this system; False where another process holds it, with `wait` for PATIENCE."""
+        deadline = time.monotonic() + (PATIENCE if wait else 0)
+        while not (taken := self._try(text)) and time.monotonic() < deadline:
+            time.sleep(POLL)
+        return taken
+
+    def _try(self, text: str) -> bool:
         if fcntl is None:
             return True
         try:
             if self._file is None:  # stays open: closing any descriptor of the file would free all of its locks
                 self._file = os.open(kernel_cache.folder() / "compiling.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-            fcntl.lockf(self._file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB), 1, self._place(text))
-        except OSError as error:  # a file system without locks, or two processes that wait for each other: both compile
-            return wait or error.errno not in (errno.EACCES, errno.EAGAIN)
+            fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, self._place(text))
+        except OSError as error:  # a file system without locks: all compile
+            return error.errno not in (errno.EACCES, errno.EAGAIN)
         self._held.add(self._place(text))
         return True
 

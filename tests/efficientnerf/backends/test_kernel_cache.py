@@ -269,6 +269,7 @@ def test_a_process_that_is_killed_while_it_saves_leaves_no_other_forms_code(tmp_
 WAITS = """
 import json, os, sys
 from efficientnerf.backends import kernel_cache
+from efficientnerf.backends.numba import runtime
 from efficientnerf.backends.numba.runtime import KernelFiles
 
 files = KernelFiles(sys.argv[1], "kernel", "sources")
@@ -284,11 +285,12 @@ if found is None:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="locks of bytes are POSIX's")
-@pytest.mark.parametrize("end", ["saves", "killed", "fails"])
+@pytest.mark.parametrize("end", ["saves", "killed", "fails", "sleeps"])
 def test_who_needs_a_form_that_another_process_compiles_waits_for_it(tmp_path: Path, end: str) -> None:
-    """And compiles it where the other was killed meanwhile, or could not."""
+    """And compiles it where the other was killed meanwhile, could not, or gets no core."""
     environment = {**os.environ, "ENERF_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(kernel_cache.ROOT)}
-    command = [sys.executable, "-c", WAITS, str(tmp_path), end]
+    program = WAITS.replace("files =", "runtime.PATIENCE = 1.0\nfiles =") if end == "sleeps" else WAITS
+    command = [sys.executable, "-c", program, str(tmp_path), end]
 
     def begun() -> subprocess.Popen[str]:
         return subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -304,7 +306,7 @@ def test_who_needs_a_form_that_another_process_compiles_waits_for_it(tmp_path: P
             assert not select.select([second.stdout], [], [], 0.5)[0]
             if end == "killed":
                 first.kill()
-            else:
+            elif end != "sleeps":
                 first.stdin.write("\n")
                 first.stdin.flush()
             found = json.loads(second.stdout.readline())
