@@ -48,5 +48,5 @@ class SplatsSettings:
 
 
 STAGE = Stage(
-    name="splats", version=18, settings=SplatsSettings, needs=("bake", "train", "poses"), run=ByName("stages.splats.run:run"), uses_device=True,
+    name="splats", version=19, settings=SplatsSettings, needs=("bake", "train", "poses"), run=ByName("stages.splats.run:run"), uses_device=True,
 )  # fmt: skip

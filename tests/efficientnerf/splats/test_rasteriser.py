@@ -10,7 +10,7 @@ from efficientnerf.backends.numba.splats import fitting, raster
 from efficientnerf.backends.numba.splats.fit import SplatFit, grouped, projected, ungrouped
 from efficientnerf.backends.numba.splats.projection import LANES, project
 from efficientnerf.backends.numba.vector.memory import pointer
-from efficientnerf.backends.splat_layout import DRAWS, GRADIENTS, OPACITY, RECORD, SCALE, SUMS, VISITS, SplatState
+from efficientnerf.backends.splat_layout import DRAWS, GRADIENTS, OPACITY, RECORD, SCALE, SUMS, VISITS, Picture, SplatState
 from efficientnerf.geometry import cameras
 from efficientnerf.splats.gaussians import Gaussians
 from efficientnerf.splats.refit import MOST_FADE, NOISE, rates_of
@@ -54,19 +54,24 @@ def step_gradients(values, lens, degree, first, sums, out):  # type: ignore[no-u
                 out[group, row, lane] = gradient[16 * row + lane]
 
 
+def gradients_of(gaussians: Gaussians, picture: Picture) -> tuple[np.ndarray, np.ndarray]:
+    """By the Gaussians' values, in rows; and the squared errors of tiles."""
+    values, lens = grouped(values_of(gaussians)), lens_of(camera())
+    records = np.zeros((16 * len(values), RECORD), np.float32)
+    pairs = projected(values, lens, gaussians.degree, records)
+    sums, errors = np.full((len(pairs.gaussian), SUMS), np.nan, np.float32), np.full(len(pairs.begin) - 1, np.nan)
+    raster.fit_tiles(slice(0, len(errors)), records, pairs, picture, sums, errors)
+    found = np.empty_like(values)
+    step_gradients(values, lens, gaussians.degree, pairs.first, sums, found)
+    return ungrouped(found, len(gaussians)), errors
+
+
 @pytest.mark.parametrize(
     ("degree", "over_all", "structure", "huber_delta"), [(2, True, 0.0, np.inf), (3, False, 0.0, 0.2), (0, True, 0.3, 0.2), (1, False, 0.3, np.inf)]
 )
 def test_gradients_are_those_of_the_plain_sums(degree: int, over_all: bool, structure: float, huber_delta: float) -> None:
     gaussians, picture = some_gaussians(count=53, degree=degree), picture_of(1, over_all, structure, huber_delta)
-    values, lens = grouped(values_of(gaussians)), lens_of(camera())
-    records = np.zeros((16 * len(values), RECORD), np.float32)
-    pairs = projected(values, lens, degree, records)
-    sums, errors = np.full((len(pairs.gaussian), SUMS), np.nan, np.float32), np.full(len(pairs.begin) - 1, np.nan)
-    raster.fit_tiles(slice(0, len(errors)), records, pairs, picture, sums, errors)
-    found = np.empty_like(values)
-    step_gradients(values, lens, degree, pairs.first, sums, found)
-    rows = ungrouped(found, len(gaussians))
+    rows, errors = gradients_of(gaussians, picture)
 
     wanted = tensors(gaussians)
     loss = reference_loss(*render_reference(*wanted, camera()), picture)
@@ -78,6 +83,20 @@ def test_gradients_are_those_of_the_plain_sums(degree: int, over_all: bool, stru
     for name, part, leaf in zip(("means", "scales", "rotations", "logits", "harmonics"), np.split(rows, [3, 6, 10, 11], axis=1), wanted, strict=True):
         gradient = leaf.grad.reshape(len(gaussians), -1).numpy()
         np.testing.assert_allclose(part, gradient, rtol=2e-3, atol=2e-4 * np.abs(gradient).max(), err_msg=name)
+
+
+def test_what_shows_in_no_pixel_but_ends_one_hides_what_lies_behind_there() -> None:
+    view = camera()
+    (fx, fy, cx, cy), depths = view.params, np.array([1.0, 1.2, 1.4, 1.6, 1.8])
+    towards = view.world_from_camera[:3, :3] @ [(17.5 - cx) / fx, (13.5 - cy) / fy, 1.0]  # the middle of a pixel
+    before = 1 - 1.01e-4 ** (1 / 3)  # three leave 1.01e-4 of the light; a fiftieth less ends a pixel, a two hundredth less does not
+    scales, opacities = np.array([99.0, 99.0, 99.0, 1e-4, 0.1]), np.array([before, before, before, 0.02, 0.0048])
+    colours = np.random.default_rng(2).normal(size=(5, 1, 3))
+    parts = view.centre + depths[:, None] * towards, np.repeat(scales[:, None], 3, axis=1), np.tile([1.0, 0, 0, 0], (5, 1)), opacities, colours
+    gaussians, picture = Gaussians(*(part.astype(np.float32) for part in parts)), picture_of(1, over_all=False)
+    wanted = tensors(gaussians)
+    reference_loss(*render_reference(*wanted, view), picture).backward()
+    np.testing.assert_allclose(gradients_of(gaussians, picture)[0][4, 11:], wanted[4].grad[4, 0], rtol=2e-3)
 
 
 def test_a_step_moves_means_by_noise_in_longest_deviations_and_takes_from_opacities() -> None:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import PRANGE, numba
-from efficientnerf.backends.splat_layout import CONIC_A, CONIC_B, CONIC_C, DEPTH, HEIGHT, REACH, TILE, WIDTH, X, Y
+from efficientnerf.backends.splat_layout import CONIC_A, CONIC_B, CONIC_C, DEPTH, HEIGHT, LANES, REACH, TILE, WIDTH, X, Y
 
 BLOCK = 4
 PARTS = 64  # of the Gaussians, whose pairs are found at the same time
@@ -25,7 +25,7 @@ class Pairs(NamedTuple):
 
     begin: np.ndarray  # (T + 1,) int64: the first of each tile, row by row
     gaussian: np.ndarray  # (P,) int32
-    mask: np.ndarray  # (P,) int32
+    mask: np.ndarray  # (P + LANES,) int32: whole vectors are read, and what is beyond P is not looked at
     slot: np.ndarray  # (P,) int32: number of the pair among those of all Gaussians, one Gaussian's after the other's
     first: np.ndarray  # (N + 1,) int64: the first slot of each Gaussian
     columns: int  # tiles along a row
@@ -181,7 +181,7 @@ def _pairs(records, columns, rows):
     _count(records, columns, rows, length, counts, first)
     _sum_up(counts, begin, first)
     count = begin[tiles]
-    masks, mask, slot = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count, np.int32)
+    masks, mask, slot = np.empty(count, np.int32), np.empty(count + LANES, np.int32), np.empty(count, np.int32)
     keys, gaussian = np.empty(count, np.uint64), np.empty(count, np.int32)
     _fill(records, columns, rows, length, counts, first, masks, keys, gaussian)
     _by_depth(begin, masks, keys, gaussian, np.empty(count, np.uint64), np.empty(count, np.int32), mask, slot)

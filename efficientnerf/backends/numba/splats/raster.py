@@ -17,7 +17,20 @@ from efficientnerf.backends.layout import SSIM_C1, SSIM_C2
 from efficientnerf.backends.numba.runtime import PRANGE, numba
 from efficientnerf.backends.numba.splats.pairs import BLOCK, Pairs
 from efficientnerf.backends.numba.splats.projection import LANES
-from efficientnerf.backends.numba.vector.maths import LOG2_E, bits_of, broadcast, exp2_neg, mask_of, maximum, minimum, select, sqrt, sum_each, sum_lanes
+from efficientnerf.backends.numba.vector.maths import (
+    LOG2_E,
+    bits_of,
+    broadcast,
+    exp2_neg,
+    lowest_bit,
+    mask_of,
+    maximum,
+    minimum,
+    select,
+    sqrt,
+    sum_each,
+    sum_lanes,
+)
 from efficientnerf.backends.numba.vector.memory import fetch_add, load, load_three, pointer, store, store_three
 from efficientnerf.backends.splat_layout import RECORD, SUMS, TILE, Picture
 from efficientnerf.backends.structure import structure_change
@@ -47,12 +60,16 @@ def _covered(strength, light, open_):
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _blend(p, bit, first, end, gaussian, mask, x, y, open_, met, place):
-    """A block front to back: colour, transmittance and how many pairs were met, whose numbers go to `met`."""
+def _blend(p, bit, first, end, gaussian, mask, x, y, open_, met, strengths, place):
+    """A block front to back: colour and transmittance to `place`; returns how many pairs were met, whose numbers go to `met`, and what they hide before it is
+    capped, zero where they do not count, to `strengths`."""
     red, green, blue, light = broadcast(_NONE, LANES), broadcast(_NONE, LANES), broadcast(_NONE, LANES), broadcast(_ONE, LANES)
-    count = 0
-    for pair in range(first, end):
-        if mask[pair] & bit:
+    count, closed = 0, False
+    for begin in range(first, end, LANES):
+        here = bits_of((load(mask, begin, LANES) & bit) != 0) & ((1 << min(LANES, end - begin)) - 1)
+        while here != 0:
+            pair = begin + lowest_bit(here)
+            here &= here - 1
             at = np.int64(gaussian[pair]) * RECORD
             _dx, _dy, strength = _exponent(p, at, x, y)
             alpha, _rest, left, counts, open_ = _covered(strength, light, open_)
@@ -61,9 +78,13 @@ def _blend(p, bit, first, end, gaussian, mask, x, y, open_, met, place):
                 red, green, blue = red + weight * p[at + layout.RED], green + weight * p[at + layout.RED + 1], blue + weight * p[at + layout.RED + 2]
                 light = select(counts, left, light)
                 met[count] = pair
+                store(strengths, count * LANES, select(counts, strength, _NONE))
                 count += 1
             if bits_of(open_) == 0:
+                closed = True
                 break
+        if closed:
+            break
     store_three(place, 0, LANES, red, green, blue)
     store(place, 48, light)
     return count
@@ -82,14 +103,14 @@ def _pixels(left, top, width, height, xs, ys):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _render_tile(tile, p, pairs, width, height, met, place, xs, ys, colour, transmittance):
+def _render_tile(tile, p, pairs, width, height, met, strengths, place, xs, ys, colour, transmittance):
     row, column = tile // pairs.columns, tile % pairs.columns
     for block in range(16):
         left, top = column * TILE + block % 4 * BLOCK, row * TILE + block // 4 * BLOCK
         if left < width and top < height:
             open_ = mask_of(_pixels(left, top, width, height, xs, ys), LANES)
             x, y = load(pointer(xs), 0, LANES), load(pointer(ys), 0, LANES)
-            _blend(p, 1 << block, pairs.begin[tile], pairs.begin[tile + 1], pairs.gaussian, pairs.mask, x, y, open_, met, pointer(place))
+            _blend(p, 1 << block, pairs.begin[tile], pairs.begin[tile + 1], pairs.gaussian, pointer(pairs.mask), x, y, open_, met, strengths, pointer(place))
             for lane in range(16):
                 i, j = top + lane // BLOCK, left + lane % BLOCK
                 if i < height and j < width:
@@ -102,10 +123,10 @@ def _render_tile(tile, p, pairs, width, height, met, place, xs, ys, colour, tran
 def _render(begin, end, workers, task, records, pairs, longest, colour, transmittance):
     for _ in numba.prange(workers):
         met, place = np.empty(longest, np.int64), np.empty(64, np.float32)
-        xs, ys = np.empty(16, np.float32), np.empty(16, np.float32)
+        xs, ys, strengths = np.empty(16, np.float32), np.empty(16, np.float32), np.empty(longest * LANES, np.float32)
         tile = begin + fetch_add(pointer(task), 0, 1)
         while tile < end:
-            _render_tile(tile, pointer(records), pairs, colour.shape[1], colour.shape[0], met, place, xs, ys, colour, transmittance)
+            _render_tile(tile, pointer(records), pairs, colour.shape[1], colour.shape[0], met, pointer(strengths), place, xs, ys, colour, transmittance)
             tile = begin + fetch_add(pointer(task), 0, 1)
 
 
@@ -168,24 +189,23 @@ def _residual(left, top, place, picture, slopes):
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _pull(p, met, count, gaussian, slot, x, y, inside, place, slopes, sums):
+def _pull(p, met, strengths, count, gaussian, slot, x, y, place, slopes, sums):
     """Sums of the pairs that a block met, added to theirs: what the error changes by, with -q / 2 (v), with that times distances (v dx, v dy, v dx dx, v dx dy,
     v dy dy) and with the colour; and the error where it shows."""
     by_red, by_green, by_blue = load_three(slopes, 0, LANES)
     red, green, blue = load_three(place, 0, LANES)
     behind = red * by_red + green * by_green + blue * by_blue + load(place, 48, LANES) * load(slopes, 48, LANES)
-    error, light, open_ = load(slopes, 64, LANES), broadcast(_ONE, LANES), inside
+    error, light = load(slopes, 64, LANES), broadcast(_ONE, LANES)
     for n in range(count):
         pair = met[n]
         at = np.int64(gaussian[pair]) * RECORD
-        dx, dy, strength = _exponent(p, at, x, y)
-        alpha, rest, left, counts, open_ = _covered(strength, light, open_)
-        weight = select(counts, light * alpha, _NONE)
+        dx, dy, strength = x - p[at + layout.X], y - p[at + layout.Y], load(strengths, n * LANES, LANES)
+        alpha = minimum(strength, layout.MOST_ALPHA)
+        rest, weight = _ONE - alpha, light * alpha
         gain = by_red * p[at + layout.RED] + by_green * p[at + layout.RED + 1] + by_blue * p[at + layout.RED + 2]
         behind = behind - weight * gain
-        v = (light * gain - behind / rest) * alpha
-        v = select(counts & (strength < layout.MOST_ALPHA), v, _NONE)
-        light = select(counts, left, light)
+        v = select(strength < layout.MOST_ALPHA, (light * gain - behind / rest) * alpha, _NONE)
+        light = light * rest
         vx, vy = v * dx, v * dy
         to = np.int64(slot[pair]) * SUMS
         found = sum_each((v, vx, vy, vx * dx, vx * dy, vy * dy, weight * by_red, weight * by_green, weight * by_blue, weight * error))
@@ -193,7 +213,7 @@ def _pull(p, met, count, gaussian, slot, x, y, inside, place, slopes, sums):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _fit_tile(tile, p, pairs, picture, met, place, slopes, xs, ys, sums):
+def _fit_tile(tile, p, pairs, picture, met, strengths, place, slopes, xs, ys, sums):
     row, column, (height, width), total = tile // pairs.columns, tile % pairs.columns, picture.mask.shape, 0.0
     for pair in range(pairs.begin[tile], pairs.begin[tile + 1]):
         for n in range(SUMS):
@@ -203,9 +223,11 @@ def _fit_tile(tile, p, pairs, picture, met, place, slopes, xs, ys, sums):
         if left < width and top < height:
             inside = mask_of(_pixels(left, top, width, height, xs, ys), LANES)
             x, y = load(pointer(xs), 0, LANES), load(pointer(ys), 0, LANES)
-            count = _blend(p, 1 << block, pairs.begin[tile], pairs.begin[tile + 1], pairs.gaussian, pairs.mask, x, y, inside, met, pointer(place))
+            count = _blend(
+                p, 1 << block, pairs.begin[tile], pairs.begin[tile + 1], pairs.gaussian, pointer(pairs.mask), x, y, inside, met, strengths, pointer(place)
+            )
             total += _residual(left, top, place, picture, slopes)
-            _pull(p, met, count, pairs.gaussian, pairs.slot, x, y, inside, pointer(place), pointer(slopes), pointer(sums))
+            _pull(p, met, strengths, count, pairs.gaussian, pairs.slot, x, y, pointer(place), pointer(slopes), pointer(sums))
     return total
 
 
@@ -213,10 +235,10 @@ def _fit_tile(tile, p, pairs, picture, met, place, slopes, xs, ys, sums):
 def _fit(begin, end, workers, task, records, pairs, longest, picture, sums, errors):
     for _ in numba.prange(workers):
         met, place, slopes = np.empty(longest, np.int64), np.empty(64, np.float32), np.empty(128, np.float32)
-        xs, ys = np.empty(16, np.float32), np.empty(16, np.float32)
+        xs, ys, strengths = np.empty(16, np.float32), np.empty(16, np.float32), np.empty(longest * LANES, np.float32)
         tile = begin + fetch_add(pointer(task), 0, 1)
         while tile < end:
-            errors[tile] = _fit_tile(tile, pointer(records), pairs, picture, met, place, slopes, xs, ys, sums)
+            errors[tile] = _fit_tile(tile, pointer(records), pairs, picture, met, pointer(strengths), place, slopes, xs, ys, sums)
             tile = begin + fetch_add(pointer(task), 0, 1)
 
 
