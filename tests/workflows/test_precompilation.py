@@ -12,7 +12,7 @@ from pipeline.executors.local import Usage
 from pipeline.executors.memory import Limit
 from workflows.asset import WORKFLOW
 from workflows.cli.resolve import Settings, read_preset, table_of
-from workflows.precompilation import start
+from workflows.precompilation import run, start
 
 
 def settings(*sets: str) -> dict[str, dict[str, Any]]:
@@ -53,6 +53,20 @@ def test_nothing_is_started_where_it_is_not_worth_it(tmp_path: Path, monkeypatch
     assert not ran(None, 2, 0)  # all stages are up to date
     assert not ran(None, 1, 1)
     assert not ran(Limit(start.MEMORY - 1, "this machine"), 2, 1)
+
+
+@pytest.mark.skipif(not hasattr(os, "nice"), reason="priorities are POSIX's")
+def test_where_a_process_may_not_be_idle_it_is_nice(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    steps: list[int] = []
+    monkeypatch.setattr(os, "nice", steps.append)
+    monkeypatch.setattr(os, "sched_setscheduler", refuse, raising=False)
+    run.give_way()
+    monkeypatch.delattr(os, "sched_setscheduler")
+    run.give_way()
+    assert steps == [run.NICE, run.NICE]
 
 
 @pytest.mark.skipif(not hasattr(os, "nice"), reason="priorities are POSIX's")

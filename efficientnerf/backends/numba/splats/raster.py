@@ -41,22 +41,21 @@ _structure_change = numba.njit(inline="always", error_model="numpy")(structure_c
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _exponent(p, at, x, y):
-    """A Gaussian's distances from pixels, and what it hides before it is capped."""
+def _strength(p, at, x, y):
+    """What a Gaussian hides of pixels before it is capped."""
     dx, dy = x - p[at + layout.X], y - p[at + layout.Y]
     q = dx * (dx * p[at + layout.CONIC_A] + dy * (_TWO * p[at + layout.CONIC_B])) + dy * dy * p[at + layout.CONIC_C]
-    return dx, dy, exp2_neg(maximum(q * (_HALF * LOG2_E), _NONE)) * p[at + layout.ALPHA]
+    return exp2_neg(maximum(q * (_HALF * LOG2_E), _NONE)) * p[at + layout.ALPHA]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _covered(strength, light, open_):
-    """Of a Gaussian over pixels that are open: alpha, 1 - alpha, the light behind it, where it shows, and which pixels stay open."""
+    """Of a Gaussian over pixels that are open: alpha, the light behind it, where it shows, and which pixels stay open."""
     alpha = minimum(strength, layout.MOST_ALPHA)
-    rest = _ONE - alpha
-    left = light * rest
+    left = light * (_ONE - alpha)
     counts = open_ & (alpha >= layout.LEAST_ALPHA)
     ends = counts & (left < layout.LEAST_TRANSMITTANCE)
-    return alpha, rest, left, counts & ~ends, open_ & ~ends
+    return alpha, left, counts & ~ends, open_ & ~ends
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -71,8 +70,8 @@ def _blend(p, bit, first, end, gaussian, mask, x, y, open_, met, strengths, plac
             pair = begin + lowest_bit(here)
             here &= here - 1
             at = np.int64(gaussian[pair]) * RECORD
-            _dx, _dy, strength = _exponent(p, at, x, y)
-            alpha, _rest, left, counts, open_ = _covered(strength, light, open_)
+            strength = _strength(p, at, x, y)
+            alpha, left, counts, open_ = _covered(strength, light, open_)
             if bits_of(counts) != 0:
                 weight = select(counts, light * alpha, _NONE)
                 red, green, blue = red + weight * p[at + layout.RED], green + weight * p[at + layout.RED + 1], blue + weight * p[at + layout.RED + 2]
