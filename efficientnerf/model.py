@@ -40,9 +40,14 @@ class Sky(nn.Module):
         return torch.sigmoid(dispatch.basis(directions, SKY_DEGREE) @ self.sh)
 
     @torch.no_grad()
-    def begin_with(self, colour: np.ndarray) -> None:
+    def begin_with_colour(self, colour: np.ndarray) -> None:
         """Start from one colour (3,), 0-1, in all directions."""
         self.sh[0] = torch.logit(torch.from_numpy(colour.astype(np.float32)), SKY_LEAST) / C0
+
+    @torch.no_grad()
+    def begin_with(self, harmonics: np.ndarray) -> None:
+        """Start from harmonics (K, 3), of what a sigmoid makes colours."""
+        self.sh.copy_(torch.from_numpy(harmonics.astype(np.float32)))
 
 
 @dataclass

@@ -54,17 +54,22 @@ def plain_weight(weight: float, fraction: float) -> float:
     return weight * min(1.0, fraction / RAMP)
 
 
-def plain_discs(pixels: Pixels) -> PlainDiscs | None:
-    """Discs of the usable pixels, about MOST_DISCS at most, as many of each view; None: there are none, or the images have alpha."""
+def plain_discs(pixels: Pixels, most_views: int | None = None) -> PlainDiscs | None:
+    """Discs of the usable pixels, about MOST_DISCS at most, as many of each view; None: there are none, or the images have alpha.
+
+    most_views  that they are looked for in, evenly spread; None: all
+    """
     if pixels.images.shape[1] != 3:
         return None
-    found = list(_discs_of_views(pixels))
+    count = len(pixels.width)
+    found = list(_discs_of(pixels, np.unique(np.linspace(0, count - 1, min(count, most_views or count)).round().astype(int)).tolist()))
     return PlainDiscs(*map(np.concatenate, zip(*found, strict=True))) if any(len(centres) for centres, _ in found) else None
 
 
-def _discs_of_views(pixels: Pixels) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _discs_of(pixels: Pixels, views: list[int]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Centres and radii of each view's discs; a large picture is searched at 1 / n of its size."""
-    for view, (begin, width, height) in enumerate(zip(pixels.offsets[:-1].tolist(), pixels.width.tolist(), pixels.height.tolist(), strict=True)):
+    for view in views:
+        begin, width, height = int(pixels.offsets[view]), int(pixels.width[view]), int(pixels.height[view])
         n = -(-max(width, height) // LONGEST)
         rows, columns = height // n, width // n
         usable = pixels.usable_of(view)[: n * rows, : n * columns].reshape(rows, n, columns, n).all(axis=(1, 3))
@@ -74,7 +79,7 @@ def _discs_of_views(pixels: Pixels) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         plain = usable & (np.hypot(across, down).max(axis=2) < EDGE)
         clear = cv2.distanceTransform(np.pad(plain.astype(np.uint8), 1), cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1] - 1  # the frame is an edge
         y, x = np.nonzero(n * clear >= LEAST_RADIUS)
-        every = -(-len(y) // (MOST_DISCS // len(pixels.width) + 1)) or 1
+        every = -(-len(y) // (MOST_DISCS // len(views) + 1)) or 1
         y, x = y[::every], x[::every]
         yield begin + (n * y + n // 2) * width + n * x + n // 2, np.minimum(n * clear[y, x], np.float32(MOST_RADIUS * max(width, height)))
 

@@ -11,6 +11,7 @@ from efficientnerf.geometry.cameras import rays
 from efficientnerf.model import Model
 from efficientnerf.training.pixels import PixelRows, Pixels
 from efficientnerf.training.settings import TrainSettings
+from efficientnerf.training.sky import sky_of
 from efficientnerf.training.sparse_depth import SparseDepthRays
 from pipeline.errors import UsageError
 from stages.cores import count_cores, in_order
@@ -100,23 +101,24 @@ def compare_with_views(s: Scene, near: float, far: float, warn: Warn) -> None:
         warn(f"{ranges}: rays miss a part of it. Leave both auto, or set planes that enclose it.")
 
 
-def begin_sky(m: Model, pixels: Pixels) -> bool:
-    """Whether the photographs of an unbounded scene have one plain colour along their borders, as before white or at night: then the sky of an untrained model
-    begins with it.
+def begin_sky(m: Model, pixels: Pixels) -> str | None:
+    """Begin the sky of an untrained model of an unbounded scene with what the photographs show of it; what that is, in words, or None: it stays grey.
 
-    Before a sky of another colour a plain backdrop is first learned as fog round each camera, which hides the subject and costs nothing: it stays.
+    Where they have one plain colour along their borders, as before white or at night, it is that: before a sky of another colour a plain backdrop is first
+    learned as fog round each camera, which hides the subject and costs nothing: it stays. Elsewhere it is what plain regions above the horizon have.
     """
     if m.background is not None or m.space.reaches_infinity or pixels.images.shape[1] == 4:  # behind an object with alpha anything may lie
-        return False
+        return None
     colours, shares = pixels.border_colours(ALIKE)
     plain = shares >= PLAIN
-    if not plain.any():
-        return False
-    colour = np.median(colours[plain], axis=0)
-    if (plain & (np.abs(colours - colour).max(axis=1) <= ALIKE)).mean() < PLAIN_VIEWS:
-        return False
-    m.sky.begin_with(colour)
-    return True
+    colour = np.median(colours[plain], axis=0) if plain.any() else np.full(3, np.nan)
+    if (plain & (np.abs(colours - colour).max(axis=1) <= ALIKE)).mean() >= PLAIN_VIEWS:
+        m.sky.begin_with_colour(colour)
+        return "the one plain colour along the photographs' borders"
+    if (harmonics := sky_of(pixels)) is None:
+        return None
+    m.sky.begin_with(harmonics)
+    return "what photographs show above the horizon"
 
 
 def sparse_depth_of(folder: Path, s: Scene, seed: int = 0) -> SparseDepthRays | None:

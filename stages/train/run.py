@@ -54,8 +54,8 @@ def trained(job: Job) -> bool:
     near, far = depth_range(s, pixels, settings, job.warn)
     exposure = begin_exposure(folder, s, pixels, settings.exposure, job.device, job.say)
     m = model(space, replace(settings, exposure="off" if exposure is None else "on"), s.background, job.device, (near, far))
-    if begin_sky(m, pixels):
-        job.say("the photographs have one plain colour along their borders: the sky begins with it")
+    if (sky := begin_sky(m, pixels)) is not None:
+        job.say(f"the sky begins with {sky}")
     if settings.plain_loss_weight > 0 and not (space.contracted and pixels.images.shape[1] == 3):
         job.say("train.plain_loss_weight has no effect: it is for contracted scenes of photographs without alpha")
     priors = mask_uncovered_cells(m, views, job)
