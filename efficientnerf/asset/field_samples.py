@@ -68,6 +68,12 @@ class FieldSamples:
         of_samples = {name: getattr(self, name)[part] for name in ("start", "extent", "weight", "thickness", "colour")}
         return FieldSamples(origin=self.origin, first=self.first[begin : end + 1] - part.start, **of_rays, **of_samples)
 
+    def colours(self) -> np.ndarray:
+        """(P, 3) float32 what the samples composite to, without what is behind them."""
+        ray = np.repeat(np.arange(len(self.pixel)), np.diff(self.first))
+        channels = [np.bincount(ray, weights=self.weight * self.colour[:, channel], minlength=len(self.pixel)) for channel in range(3)]
+        return np.stack(channels, axis=1).astype(np.float32) / np.float32(255)
+
     def points(self, samples: np.ndarray, ray: np.ndarray) -> np.ndarray:
         """World points (n, 3) in the middle of some samples, of which the rays are given."""
         along = self.start[samples] + self.extent[samples] / 2

@@ -120,7 +120,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=27,
+    version=28,
     settings=BakeSettings,
     needs=("poses", "train"),
     run=ByName("stages.bake.run:run"),

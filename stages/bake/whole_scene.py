@@ -8,7 +8,7 @@ N voxels, P rays.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,7 @@ from efficientnerf.asset.field_samples import (
 from efficientnerf.asset.tree import Region
 from efficientnerf.capture.foreground import find_subject
 from efficientnerf.model import Model
+from efficientnerf.rendering.environment import lookup
 from efficientnerf.training.pixels import Pixels
 from pipeline.stage import Job
 from stages.bake.holes import END_WEIGHT
@@ -47,6 +48,7 @@ MAX_RATIO = 0.6  # scene bounds, of the foreground region's longest side. docs/e
 # Where no training image looks, but the next view, which lies between no two of them, may: what the field shows there is baked too. Rays past the borders of
 # training images, of those within. docs/experiments/whole-scene.md
 PAST_SHARE = 0.3
+CLEAR = 0.5  # share of a training ray's light that is left, from which the environment map gets it from the photograph
 FOREGROUND_RAYS = 2**18  # that the foreground region is found from
 CENTRES_PER_BLOCK = 2**20
 KINDS = {
@@ -129,9 +131,22 @@ class Cascades:
         samples, brick = self.samples, self.plan.brick_size
         some = samples.training.pixel
         mean = self.pixels.images[some[:: max(1, len(some) // 4096)]][:, :3].mean(axis=0) / 255.0
-        environment = environment_beyond(samples, boxes_of(grids, brick), self.plan.environment_size, mean)
+        environment = self._environment(boxes_of(grids, brick), mean)
         weights = [seen_weights(one, part, shape, brick) for one, part, (shape, _, _) in zip(seen, indices, grids, strict=True)]
         return Surroundings(samples, self.region, weights, environment)
+
+    def _environment(self, boxes: Sequence[np.ndarray], mean: np.ndarray) -> np.ndarray:
+        """(H, 2 H, 3) what lies beyond nested boxes (2, 3): behind what is mostly transparent, as the photographs show it, for the field's own sky is a smooth
+        function; the same behind rays past their borders."""
+        samples, size, behind = self.samples, self.plan.environment_size, self.samples.behind.astype(np.float32)
+        shown = samples.training.colours()
+        rest = 1 - samples.opacity[: len(shown)]
+        clear = rest > CLEAR
+        taken = self.pixels.images[samples.pixel[: len(shown)][clear]][:, :3] / np.float32(255)
+        behind[: len(shown)][clear] = ((taken - shown[clear]) / rest[clear, None]).clip(0, 1)
+        map_of_training = environment_beyond(replace(samples.training, behind=behind[: len(shown)]), boxes, size, mean)
+        behind[len(shown) :] = lookup(map_of_training, samples.direction[len(shown) :])
+        return environment_beyond(replace(samples, behind=behind), boxes, size, mean)
 
 
 def kept_by(keep: Callable[[np.ndarray], np.ndarray], indices: np.ndarray, grid: Grid) -> np.ndarray:

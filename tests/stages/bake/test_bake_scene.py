@@ -10,11 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from efficientnerf.asset import field_samples, format
 from efficientnerf.asset.cascades import cascades_of, voxel_cascades, voxel_coordinates
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.geometry.cameras import rays
+from efficientnerf.rendering import environment
 from efficientnerf.rendering.colour import linear_from_srgb, srgb_from_linear
 from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.training.exposure.model import exposure_of
@@ -104,6 +107,24 @@ def test_what_training_learned_of_the_exposure_is_left_out_of_the_asset(
     usual = json.loads((undisturbed[0] / "out" / "report.json").read_text())["optimisation"]["psnr_after"]
     assert psnr[True] == pytest.approx(usual, abs=0.3)
     assert psnr[False] < usual - 1
+
+
+def test_the_environment_map_shows_what_photographs_do_where_the_sky_of_the_field_is_another(
+    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other, camera = surroundings(), around(9)[0]
+    with torch.no_grad():
+        other.sky.sh[0] += 3.0
+    monkeypatch.setattr("stages.bake.run.load_renderer", lambda folder, device="cpu": FieldRenderer(other, 0.2, 60.0))
+    tree, _ = baked(tmp_path, inputs)
+    taken = FieldRenderer(surroundings(), 0.2, 60.0).render(camera)
+    _, directions = rays(camera)
+    clear = (taken.opacity < 0.01).ravel()
+    assert clear.sum() > 50
+    shown = environment.lookup(tree.environment, directions[clear])  # type: ignore[arg-type]
+    wrong = np.abs(other.sky(torch.from_numpy(directions[clear].astype(np.float32))).detach().numpy() - taken.colour.reshape(-1, 3)[clear])
+    assert wrong.mean() > 0.05
+    assert np.abs(shown - taken.colour.reshape(-1, 3)[clear]).mean() < 0.2 * wrong.mean()
 
 
 def test_the_same_twice_and_stopped_anywhere(inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[Path, int]) -> None:
