@@ -70,9 +70,12 @@ class FieldSamples:
 
     def colours(self) -> np.ndarray:
         """(P, 3) float32 what the samples composite to, without what is behind them."""
-        ray = np.repeat(np.arange(len(self.pixel)), np.diff(self.first))
-        channels = [np.bincount(ray, weights=self.weight * self.colour[:, channel], minlength=len(self.pixel)) for channel in range(3)]
-        return np.stack(channels, axis=1).astype(np.float32) / np.float32(255)
+        out = np.zeros((len(self.pixel), 3), np.float32)
+        for rays, part in self.blocks():
+            ray = np.repeat(np.arange(rays.stop - rays.start), np.diff(self.first[rays.start : rays.stop + 1]))
+            for channel in range(3):
+                out[rays, channel] = np.bincount(ray, weights=self.weight[part] * self.colour[part, channel] / 255.0, minlength=rays.stop - rays.start)
+        return out
 
     def points(self, samples: np.ndarray, ray: np.ndarray) -> np.ndarray:
         """World points (n, 3) in the middle of some samples, of which the rays are given."""
