@@ -14,7 +14,7 @@ from efficientnerf.fields.field import Field
 from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.geometry.spaces import RayBundle, Space, voxel_centres
 from efficientnerf.rendering.compositing import Composite, ray_of_sample
-from efficientnerf.rendering.harmonics import C0, harmonics_count
+from efficientnerf.rendering.harmonics import harmonics_count
 from efficientnerf.sampling.occupancy import DensityVoxels, density_voxels
 from efficientnerf.sampling.samples import SampleCapacity, Samples
 from efficientnerf.sampling.strategies import Efficient, Hierarchical, Intervals, SamplingRequest, Strategy, Uniform, Valid
@@ -38,11 +38,6 @@ class Sky(nn.Module):
     def forward(self, directions: Tensor) -> Tensor:
         """Colours (R, 3) along unit directions (R, 3)."""
         return torch.sigmoid(dispatch.basis(directions, SKY_DEGREE) @ self.sh)
-
-    @torch.no_grad()
-    def begin_with_colour(self, colour: np.ndarray) -> None:
-        """Start from one colour (3,), 0-1, in all directions."""
-        self.sh[0] = torch.logit(torch.from_numpy(colour.astype(np.float32)), SKY_LEAST) / C0
 
     @torch.no_grad()
     def begin_with(self, harmonics: np.ndarray) -> None:

@@ -10,7 +10,7 @@ P pixels, K harmonics.
 import numpy as np
 
 from efficientnerf.model import SKY_DEGREE, SKY_LEAST
-from efficientnerf.rendering.harmonics import basis_numpy
+from efficientnerf.rendering.harmonics import C0, basis_numpy, harmonics_count
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.plain_regions import plain_discs
 
@@ -23,6 +23,13 @@ SCALE = 0.05  # of the differences of colours that count less and less
 MOST_OFF = 0.08  # median of them, from which what is plain there is no function of the direction
 ROUNDS = 10  # of weighted least squares
 GREY = 800  # random directions, of which those below the horizon are drawn to grey, as they were
+
+
+def sky_of_colour(colour: np.ndarray) -> np.ndarray:
+    """(K, 3) harmonics of a sky of one colour (3,), 0-1."""
+    out = np.zeros((harmonics_count(SKY_DEGREE), 3))
+    out[0] = _logit(colour) / C0
+    return out
 
 
 def sky_of(pixels: Pixels) -> np.ndarray | None:
@@ -55,8 +62,7 @@ def _fitted(directions: np.ndarray, colours: np.ndarray, view: np.ndarray) -> tu
     below /= np.linalg.norm(below, axis=1, keepdims=True)
     grey = basis_numpy(below[below[:, 2] < -2 * HORIZON], SKY_DEGREE)
     grey = grey.T @ grey / len(grey)
-    bounded = colours.clip(SKY_LEAST, 1 - SKY_LEAST)
-    wanted = np.log(bounded / (1 - bounded))
+    wanted = _logit(colours)
     weight, off = each, np.zeros(len(colours))
     for _ in range(ROUNDS):
         weighted = (weight / weight.sum())[:, None] * shown
@@ -65,3 +71,9 @@ def _fitted(directions: np.ndarray, colours: np.ndarray, view: np.ndarray) -> tu
         weight = each / (1 + (off / SCALE) ** 2)
     order = np.argsort(off)
     return harmonics, float(off[order[np.searchsorted(np.cumsum(each[order]), each.sum() / 2)]])
+
+
+def _logit(colours: np.ndarray) -> np.ndarray:
+    """What the sky's sigmoid makes colours of."""
+    bounded = colours.clip(SKY_LEAST, 1 - SKY_LEAST)
+    return np.asarray(np.log(bounded / (1 - bounded)))

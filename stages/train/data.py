@@ -11,7 +11,7 @@ from efficientnerf.geometry.cameras import rays
 from efficientnerf.model import Model
 from efficientnerf.training.pixels import PixelRows, Pixels
 from efficientnerf.training.settings import TrainSettings
-from efficientnerf.training.sky import sky_of
+from efficientnerf.training.sky import sky_of, sky_of_colour
 from efficientnerf.training.sparse_depth import SparseDepthRays
 from pipeline.errors import UsageError
 from stages.cores import count_cores, in_order
@@ -113,7 +113,7 @@ def begin_sky(m: Model, pixels: Pixels) -> str | None:
     plain = shares >= PLAIN
     colour = np.median(colours[plain], axis=0) if plain.any() else np.full(3, np.nan)
     if (plain & (np.abs(colours - colour).max(axis=1) <= ALIKE)).mean() >= PLAIN_VIEWS:
-        m.sky.begin_with_colour(colour)
+        m.sky.begin_with(sky_of_colour(colour))
         return "the one plain colour along the photographs' borders"
     if (harmonics := sky_of(pixels)) is None:
         return None
