@@ -124,7 +124,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="poses",
-    version=22,
+    version=23,
     settings=PosesSettings,
     needs=(),
     run=ByName("stages.poses.run:run"),

@@ -3,6 +3,7 @@
 See docs/experiments/sfm.md.
 """
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -23,6 +24,9 @@ MIN_MATCHES = 30  # verified ones of a pair, from which it says something about 
 MAX_EPIPOLAR_ERROR = 4.0  # px at working size, of the epipolar error of a match that agrees with the cameras
 MANY_OBSERVATIONS = 150_000  # of points in images; of more, an even choice holds the cameras as well
 MIN_REGISTERED_RATIO = 0.95  # of the photographs: later steps may bring back the others
+# A focal length farther from its EXIF data than this (of its logarithm) has to lower the reprojection error by this many times as much, else that of the EXIF
+# data is used: photographs straight down on flat ground, or a way straight ahead, do not determine it. docs/experiments/sfm.md
+MAX_EXIF_DEVIATION, MIN_ERROR_GAIN = 0.1, 0.5
 FEW_POINTS = 300  # points: a photograph with no more keeps all of them
 # Global bundle adjustments: one each time photographs or points have grown by these ratios, over the points that hold the cameras, and loosely converged,
 # for `bundle_adjusted` follows. COLMAP's own options take twice the time. docs/experiments/sfm.md
@@ -77,6 +81,23 @@ def _cameras_with_exif_focal(images: Sequence[WorkImage], model: Any) -> list[tu
 def cameras_with_fixed_focal(images: Sequence[WorkImage], model: Any) -> set[int]:
     """COLMAP's ids of the cameras whose intrinsics were fixed at their EXIF data."""
     return {camera.camera_id for camera, prior in _cameras_with_exif_focal(images, model) if camera.mean_focal_length() == prior}
+
+
+def _with_exif_focal(pycolmap: Any, images: Sequence[WorkImage], model: Any) -> Any:
+    """The model with the focal lengths of the EXIF data, where its own are far from them without explaining the observations much better."""
+    priors = [(camera, prior) for camera, prior in _cameras_with_exif_focal(images, model) if prior]
+    deviations = [abs(math.log(camera.mean_focal_length() / prior)) for camera, prior in priors]
+    if not deviations or max(deviations) < MAX_EXIF_DEVIATION:
+        return model
+    held = model.__deepcopy__({})
+    for camera, prior in priors:
+        for number in camera.focal_length_idxs():
+            held.cameras[camera.camera_id].params[number] = prior
+    unknown = {*held.cameras} - {camera.camera_id for camera, _ in priors}
+    for _ in range(2):  # the first goes far, under a loss of the wide scale that it begins with
+        bundle_adjust(pycolmap, held, unknown, {"refine_focal_length": False})
+    gain = held.compute_mean_reprojection_error() / model.compute_mean_reprojection_error() - 1
+    return held if gain < MIN_ERROR_GAIN * float(np.mean(deviations)) else model
 
 
 def contradicts_exif(focal: float, prior: float | None) -> bool:
@@ -144,7 +165,8 @@ def bundle_adjusted(work: Path, images: Sequence[WorkImage], model: Any, safe_po
 
     Cameras get OPENCV's eight parameters in place of SIMPLE_RADIAL where these lower the mean reprojection error by 1 %, after adjusting all
     parameters; unless the focal lengths then differ by 2 %, or fewer matches agree, which shows that the motion does not determine the intrinsics.
-    Intrinsics fixed at the EXIF data stay. Of a model with MANY_OBSERVATIONS an even choice of points tells the cameras; the others follow.
+    Intrinsics fixed at the EXIF data stay, and focal lengths that are not determined become those of the EXIF data. Of a model with MANY_OBSERVATIONS an
+    even choice of points tells the cameras; the others follow.
     """
     some = thinned(model, MANY_OBSERVATIONS)
     if some is None:
@@ -185,7 +207,7 @@ def _with_adjusted_cameras(work: Path, images: Sequence[WorkImage], model: Any, 
         simple = {camera_id for camera_id in counts if model.cameras[camera_id].model == pycolmap.CameraModelId.SIMPLE_RADIAL}
         refinable = [camera_id for camera_id in sorted(simple - fixed) if counts[camera_id] >= 10]  # fewer would be overfitted
         if not refinable:
-            return model
+            return _with_exif_focal(pycolmap, images, model)
         richer = model.__deepcopy__({})
         for camera_id in refinable:
             camera = richer.cameras[camera_id]
@@ -195,7 +217,9 @@ def _with_adjusted_cameras(work: Path, images: Sequence[WorkImage], model: Any, 
         bundle_adjust(pycolmap, richer, fixed)
         better = richer.compute_mean_reprojection_error() < 0.99 * model.compute_mean_reprojection_error()
     square = all(abs(richer.cameras[i].focal_length_x / richer.cameras[i].focal_length_y - 1) < 0.02 for i in refinable)
-    return richer if better and square and match_agreement(work, richer) >= match_agreement(work, model) - 0.001 else model
+    best = richer if better and square and match_agreement(work, richer) >= match_agreement(work, model) - 0.001 else model
+    with quiet_pycolmap() as pycolmap:
+        return _with_exif_focal(pycolmap, images, best)
 
 
 def bundle_adjust(

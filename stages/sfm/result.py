@@ -46,6 +46,11 @@ def capture_of(search: Search, model: Any, paths: Mapping[str, Path], masks: Mas
     angle = round(parallax(points, photos).angle, 3)
     counts = {"photographs": len(search.images), "registered": len(photos), "points": len(points.xyz)}
     warnings = _model_warnings(photos, points, agreement, [source.focal for source in sources])
+    if mapping.cameras_with_fixed_focal(search.images, model):
+        warnings.append(
+            "The photographs do not determine the focal length, and with it depths: that of the EXIF data is used. Photographs at other angles would tell, "
+            "as some that are not taken straight down."
+        )
     if rejected:
         which = abbreviated([name for name, _ in rejected], MAX_NAMES)
         warnings.append(f"{len(rejected)} photograph{'s' if len(rejected) > 1 else ''} not registered: {which}.")
