@@ -242,7 +242,10 @@ def _of_parts(capture: Capture) -> list[Problem]:
     parts, models = [count for count in capture.provenance.components or () if count >= MIN_IMAGES], capture.provenance.models or ()
     found = []
     if len(parts) > 1:
-        sentence = f"The photographs fall into {len(parts)} groups that do not overlap, of {', '.join(map(str, parts))}; the largest is used."
+        sizes = ", ".join(map(str, parts))
+        sentence = f"The photographs fall into {len(parts)} groups that do not overlap, of {sizes}; the largest is used."
+        if len(capture.photos) >= sum(parts):
+            sentence = f"The photographs fall into {len(parts)} groups that hardly overlap, of {sizes}; few matches tie their cameras."
         found.append(Problem("components", "usable", sentence, MORE_PHOTOGRAPHS))
     if len(models) > 1:
         sentence = f"There are {len(models)} sub-models, of {', '.join(map(str, models))} photographs; the largest is used."

@@ -134,6 +134,13 @@ def test_each_problem_has_its_grade_and_remedy(changes: dict[str, object], what:
     assert found.problems[0].remedy
 
 
+def test_groups_that_all_have_cameras_are_not_left_out() -> None:
+    dropped, tied = (verdict_on(capture(provenance=Provenance(components=parts)), sharp(NAMES)).problems[0] for parts in ([24, 7], [17, 7]))
+    assert (dropped.what, tied.what) == ("components", "components")
+    assert "largest is used" in dropped.sentence
+    assert "largest is used" not in tied.sentence
+
+
 def test_matches_that_disagree_with_cameras_of_little_parallax_are_worse_than_either() -> None:
     doubtful = Provenance(pairs_agreeing=0.85)
     assert verdict_on(capture(radius=0.22), sharp(NAMES)).grade == "usable"
