@@ -94,6 +94,11 @@ def mask_cells(voxels: DensityVoxels, chosen: Tensor) -> None:
     voxels.values.masked_fill_(chosen.to(voxels.values.device), -torch.inf)
 
 
+def open_cells(voxels: DensityVoxels, chosen: Tensor) -> None:
+    """Give those of these voxels, (D, D, D) bool, that are masked their initial value."""
+    voxels.values.masked_fill_(chosen.to(voxels.values.device) & torch.isneginf(voxels.values), voxels.start)
+
+
 def reset_cells(voxels: DensityVoxels, wanted: Tensor | None = None) -> None:
     """Set all voxels that are not masked to their initial value; only if `wanted`, a bool that may be on a device, is true."""
     kept = torch.isneginf(voxels.values)

@@ -23,6 +23,7 @@ from efficientnerf.backends import dispatch
 from efficientnerf.backends.transfer import sent
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.model import Model, RayOutputs
+from efficientnerf.sampling.occupancy import mask_cells, open_cells
 from efficientnerf.sampling.strategies import Efficient
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.exposure.model import Exposure, is_learned
@@ -37,6 +38,7 @@ from efficientnerf.training.step import Learner, StepInputs, StepNumbers, StepPl
 from efficientnerf.training.step_graphs import StepGraphs
 from efficientnerf.training.view_checks.checks import ViewChecks, follow_checks
 
+OPENS_AT = 0.25  # of the steps, at which voxels that are closed at first open. docs/experiments/near-cameras.md
 MAX_STEPS = 2**40  # of a run: beyond any practical one
 
 
@@ -66,14 +68,18 @@ class Trainer:
     samples_per_ray: float = 0.0  # the running average that sets the number of rays
     exposure: Exposure | None = None  # of the photographs (`efficientnerf.training.exposure.model`), where it is learned, or None
     checks: ViewChecks | None = None  # of the training views (`efficientnerf.training.view_checks.checks`), or None
+    closed: Tensor | None = None  # (D, D, D) bool: density voxels that are masked until OPENS_AT of the steps
 
 
-def trainer(m: Model, exposure: Exposure | None = None, schedule: Schedule | None = None, cameras: Sequence[Camera] = ()) -> Trainer:
+def trainer(
+    m: Model, exposure: Exposure | None = None, schedule: Schedule | None = None, cameras: Sequence[Camera] = (), closed: Tensor | None = None
+) -> Trainer:
     """A trainer at its beginning.
 
     exposure  of the training images, that is learned; None: none is
     schedule  None: that of the model's settings
     cameras   of the training images, needed where they are checked
+    closed    (D, D, D) bool: density voxels that are masked until OPENS_AT of the steps
     """
     schedule = schedule or schedule_of(m.settings)
     groups = parameter_groups(m)
@@ -81,8 +87,11 @@ def trainer(m: Model, exposure: Exposure | None = None, schedule: Schedule | Non
         groups.append(ParameterGroup(exposure.parameters))
     # At first every interval counts as sampled, with as many pivots as allowed.
     samples = float(m.max_intervals + m.settings.max_pivots * schedule.samples_per_pivot_at(0))
+    if closed is not None:
+        closed = closed & ~torch.isneginf(m.voxels.values.cpu())  # those that are masked for good stay
+        mask_cells(m.voxels, closed)
     checks = ViewChecks.none(cameras) if m.settings.wrong_views == "auto" and cameras else None
-    return Trainer(m, Adam(groups, m.settings.adam_beta2, m.settings.adam_epsilon), schedule, 0, samples, exposure, checks)
+    return Trainer(m, Adam(groups, m.settings.adam_beta2, m.settings.adam_epsilon), schedule, 0, samples, exposure, checks, closed)
 
 
 def state_of(t: Trainer) -> dict[str, Tensor]:
@@ -137,6 +146,9 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
         numbers = StepNumbers(t.adam.step_size(number, rate), m.distortion_weight(fraction), weight, plain_weight(settings.plain_loss_weight, fraction))
         count = ray_count(settings, t.samples_per_ray)
         with graphs.ordered():
+            if t.closed is not None and fraction >= OPENS_AT:
+                open_cells(m.voxels, t.closed)
+                t.closed = None
             count = count if readback is None else graphs.rays(count)
             inputs = drawn_step(learner, sparse_depth if weight > 0 else None, plain, count, rng, crop=number <= settings.precrop_steps)
             aimed = 0 if inputs.aimed is None else len(inputs.aimed.distance)

@@ -12,6 +12,9 @@ cameras stand in, and an asset, whose rays begin at the eye, would show it as fo
 BEFORE_VIEWS views that have them in view are masked, and those close to the cameras and to the way from each to its neighbours.
 See docs/experiments/near-cameras.md.
 
+All round a subject, what only opposite views see lies in the open, too: the background behind the subject, learned among the cameras. These density voxels
+are closed at first, so that it is learned farther away. See docs/experiments/near-cameras.md.
+
 Reliable sparse points are evidence that space is filled: what would mask more than MAX_CONTRADICTED of them is refuted, and masks nothing. See docs/priors.md.
 """
 
@@ -20,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
 from efficientnerf.capture.coverage import meeting_point
@@ -44,6 +48,9 @@ MAX_FRACTION = 4  # at most one in so many of the cameras (rounded up) is requir
 NEAREST = 0.1  # share of the cameras that may be nearer to the box's centre than what counts as standing before it
 BEFORE, BEHIND = 0.75, 1.1  # of the depth of the box's centre: what is nearer to a camera stands before the box, what is farther away behind it
 WIDENED = 1.5  # times a picture's sides: neighbouring cameras see what misses the picture by no more
+AMONG = 70  # degrees, seen from the box's centre, within which a camera is farther away than what lies among the cameras
+AMONG_BLOCK = 2  # density voxels along a side of the blocks that lie among them
+AROUND_POINTS = 2  # such blocks round a reliable sparse point that are open from the first step
 FEW_BLOCK = 2  # density voxels along a side of the blocks outside the box that few views show
 
 
@@ -150,6 +157,45 @@ def cells_without_view(space: Space, cameras: Sequence[Camera], side: int, masks
     for axis in range(3):
         free = np.repeat(free, BLOCK, axis)
     return free[:side, :side, :side]
+
+
+def cells_among_cameras(space: Space, cameras: Sequence[Camera], side: int, filled: np.ndarray | None = None) -> np.ndarray:
+    """(D, D, D) bool of the density voxels of a contracted space, D = `side`: those outside the box and `among` the cameras, by the middles of blocks.
+
+    filled  (F, 3) reliable sparse points, round which there are none
+    """
+    count = -(-side // AMONG_BLOCK)
+    lattice = np.minimum((np.arange(count) + 0.5) * (AMONG_BLOCK / side), 1.0)
+    grid = np.stack(np.meshgrid(*(lattice,) * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    world, (low, high) = space.world(torch.from_numpy(grid)).numpy(), np.asarray(space.bounds, np.float64)
+    at = np.flatnonzero(~((world >= low) & (world <= high)).all(axis=1))
+    found = np.zeros((count,) * 3, bool)
+    found.flat[at[among(world[at], cameras, (low + high) / 2)]] = True
+    if filled is not None and len(filled):
+        places = np.floor(space.grid(torch.from_numpy(np.asarray(filled, np.float64))).numpy() * count).astype(np.int64)
+        points = np.zeros((count,) * 3, bool)
+        points[tuple(places[((places >= 0) & (places < count)).all(axis=1)].T)] = True
+        found &= ~binary_dilation(points, iterations=AROUND_POINTS)
+    for axis in range(3):
+        found = np.repeat(found, AMONG_BLOCK, axis)
+    return found[:side, :side, :side]
+
+
+def among(points: np.ndarray, cameras: Sequence[Camera], middle: np.ndarray) -> np.ndarray:
+    """(N,) bool: points (N, 3) that, seen from `middle` (3,), have a camera within AMONG degrees and farther away, while every camera that has them in view
+    has them farther away than BEHIND of the depth of `middle`."""
+    out, centres = np.zeros(len(points), bool), np.array([camera.centre for camera in cameras]) - middle
+    away, distance = np.linalg.norm(centres, axis=1), np.linalg.norm(points - middle, axis=1)
+    at = np.flatnonzero(distance < away.max())
+    towards = (points[at] - middle) @ (centres / away[:, None]).T / distance[at, None]
+    at = at[((towards > np.cos(np.radians(AMONG))) & (away > distance[at, None])).any(axis=1)]
+    for camera in cameras:
+        pixels, depth = project(camera, points[at])
+        with np.errstate(invalid="ignore"):
+            inside = np.asarray((depth > 0) & (pixels >= 0).all(1) & (pixels <= (camera.width, camera.height)).all(1))
+        at = at[~(inside & (depth < BEHIND * float((middle - camera.centre) @ camera.forward)))]
+    out[at] = True
+    return out
 
 
 def cells_before_near(space: Space, cameras: Sequence[Camera], near: Sequence[float], side: int, filled: np.ndarray | None = None) -> np.ndarray:

@@ -4,6 +4,8 @@
     near_planes  what lies before the near planes, and close to the cameras, is empty
     masks        what no view shows in a pixel that its mask keeps is left out
 
+And `among_cameras`, which masks voxels until a quarter of the steps alone: all round a subject, what opposite views alone see is background.
+
 Reliable sparse points (`stages.framing.near_planes`) are evidence that space is filled. The first two are dropped where they contradict more than
 MAX_CONTRADICTED of them; masks are given by the user, or by a stage that has checked them. All rules of the program: docs/priors.md.
 """
@@ -15,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from efficientnerf.capture.coverage import meeting_point
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.model import Model
 from efficientnerf.sampling.occupancy import mask_cells
@@ -22,7 +25,16 @@ from efficientnerf.settings import resolved
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
 from stages.framing.near_planes import reliable_points
-from stages.framing.view_coverage import MAX_CONTRADICTED, Masks, cells_before_near, cells_below_min_views, cells_without_view, contradicted, kept_pixels
+from stages.framing.view_coverage import (
+    MAX_CONTRADICTED,
+    Masks,
+    cells_among_cameras,
+    cells_before_near,
+    cells_below_min_views,
+    cells_without_view,
+    contradicted,
+    kept_pixels,
+)
 from stages.io import scene
 from stages.io.scene import View
 
@@ -78,6 +90,15 @@ def _cells_of_priors(
         yield "near_planes", cells_before_near(m.space, cameras, near, side, filled)
     if masks is not None:
         yield "masks", cells_without_view(m.space, cameras, side, masks)
+
+
+def cells_closed_at_first(m: Model, views: tuple[View, ...], folder: Path) -> torch.Tensor | None:
+    """(D, D, D) bool: the density voxels among the cameras of a scene, which open later (`efficientnerf.training.loop.Trainer.closed`); None where the cameras
+    do not stand round a subject."""
+    cameras = [view.camera for view in views]
+    if not m.space.contracted or not meeting_point(cameras)[1]:
+        return None
+    return torch.from_numpy(cells_among_cameras(m.space, cameras, m.voxels.side, filled_points(folder, len(views))))
 
 
 def filled_points(folder: Path, views: int) -> np.ndarray | None:

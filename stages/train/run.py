@@ -31,7 +31,7 @@ from stages.train.hash_resolution import with_auto_sizes
 from stages.train.log import TrainLog
 from stages.train.memory import rows_for_training
 from stages.train.previews import Previews
-from stages.train.priors import Prior, mask_uncovered_cells
+from stages.train.priors import Prior, cells_closed_at_first, mask_uncovered_cells
 
 
 @running_kernels
@@ -60,7 +60,7 @@ def trained(job: Job) -> bool:
         job.say("train.plain_loss_weight has no effect: it is for contracted scenes of photographs without alpha")
     priors = mask_uncovered_cells(m, views, job)
 
-    t = loop.trainer(m, exposure, cameras=[view.camera for view in views])
+    t = loop.trainer(m, exposure, cameras=[view.camera for view in views], closed=cells_closed_at_first(m, views, folder))
     checkpoints = Checkpoints(job)
     spent = checkpoints.restore(t, settings.iterations if settings.time_budget == "off" else UNKNOWN)
     log = TrainLog(job.work / TrainOutputs.log, t.step, spent, AsyncOccupancy(m.voxels), clock)

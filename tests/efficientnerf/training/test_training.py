@@ -13,7 +13,8 @@ import torch
 from efficientnerf.backends import transfer
 from efficientnerf.backends.transfer import sent
 from efficientnerf.model import Model, render_rays
-from efficientnerf.training.loop import Progress, restore, state_of, train, trainer
+from efficientnerf.sampling.occupancy import mask_cells
+from efficientnerf.training.loop import Progress, Trainer, restore, state_of, train, trainer
 from efficientnerf.training.optimiser import Adam, parameter_groups
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.schedule import Schedule, schedule_of
@@ -93,6 +94,34 @@ def test_a_restored_trainer_goes_on_to_the_same_bytes(field: str, at: int) -> No
     assert len(rest) == 10 - at
     for name, tensor in state_of(whole).items():
         assert torch.equal(tensor, state_of(resumed)[name]), name
+
+
+def test_voxels_that_are_closed_at_first_open_after_a_quarter_of_the_steps() -> None:
+    def begun() -> Trainer:
+        m = untrained(iterations=12, occupancy_warmup_steps=5, sample_batch_size=2048)
+        closed = torch.zeros_like(m.voxels.values, dtype=torch.bool)
+        closed[:, : m.voxels.side // 2] = True
+        for_good = torch.zeros_like(closed)
+        for_good[:, :, :4] = True
+        mask_cells(m.voxels, for_good)
+        return trainer(m, closed=closed)
+
+    whole, masked, kept = begun(), [], {}
+    half = torch.isneginf(whole.model.voxels.values)
+    for done in train(whole, pixels()):
+        masked.append(torch.isneginf(whole.model.voxels.values))
+        kept[done.step] = {name: tensor.clone() for name, tensor in state_of(whole).items()}
+    assert all(torch.equal(now, half) for now in masked[:2])
+    assert half[:, : half.shape[1] // 2].all()
+    for now in masked[2:]:  # those of the first row of blocks stay masked
+        assert now[:, :, :4].all()
+        assert not now[:, :, 4:].any()
+    for at in (2, 3, 7):
+        resumed = begun()
+        restore(resumed, kept[at])
+        list(train(resumed, pixels()))
+        for name, tensor in kept[12].items():
+            assert torch.equal(tensor, state_of(resumed)[name]), name
 
 
 def test_transparent_pixels_teach_no_colour() -> None:

@@ -16,7 +16,9 @@ from stages.bake import run as bake
 from stages.bake.settings import BakeSettings
 from stages.framing.scene_bounds import shows
 from stages.framing.view_coverage import (
+    among,
     before_near,
+    cells_among_cameras,
     cells_before_near,
     cells_below_min_views,
     cells_without_view,
@@ -29,6 +31,7 @@ from stages.io.scene import load as load_scene
 from stages.io.scene import save as save_scene
 from stages.train import run as train
 from tests.efficientnerf import balls
+from tests.poses import looking_at
 from tests.stages.balls import job, poses
 
 SPACE = ContractedSpace(np.array([[-1.0, -0.8, -1.0], [1.0, 0.9, 1.2]]))
@@ -185,3 +188,36 @@ def test_space_that_cameras_look_through_is_masked_and_no_other(count: int) -> N
         assert masked[tuple((at * side).astype(int))]
         beyond = SPACE.grid(torch.from_numpy(camera.centre + 1.6 * plane * camera.forward)).numpy()
         assert not masked[tuple((beyond * side).astype(int))]
+
+
+def ring(count: int, degrees: float = 360.0, height: float = 2.0) -> list[Camera]:
+    """Cameras 4 away from the middle of the box, on a part of a circle, which look at it."""
+    made = []
+    for angle in np.radians(np.arange(count) * degrees / count):
+        centre = SPACE.centre + np.array([4 * np.cos(angle), 4 * np.sin(angle), height])
+        made.append(Camera("", 64, 48, "SIMPLE_PINHOLE", (60.0, 32.0, 24.0), looking_at(centre, SPACE.centre)))
+    return made
+
+
+def test_what_opposite_views_alone_see_lies_among_the_cameras() -> None:
+    points = SPACE.centre + np.array([[3.0, 0.0, 0.5], [-2.0, 2.0, 0.5], [0.0, 0.0, 0.5], [3.0, 0.0, -3.0], [7.0, 0.0, 2.0]])
+    all_round = ring(12)
+    assert among(points[:2], all_round, SPACE.centre).all()  # between the cameras' places and the subject, below what those there see
+    assert not among(points[2:], all_round, SPACE.centre).any()  # the subject, what is far below the cameras, or beyond them
+    # Cameras on one side have the wall behind the subject in view, and stand on the other side of it.
+    assert not among(SPACE.centre - np.array([[3.0, 0.0, 0.0], [2.0, 0.5, 0.5]]), ring(5, 60.0), SPACE.centre).any()
+
+
+def test_voxels_among_the_cameras_are_outside_the_box_and_away_from_sparse_points() -> None:
+    side, cameras = 32, ring(12)
+    cells = cells_among_cameras(SPACE, cameras, side)
+    inside = slice(side // 4, 3 * side // 4)
+    assert cells.any()
+    assert not cells[inside, inside, inside].any()
+    middles = SPACE.world(torch.from_numpy((np.argwhere(cells) // 2 * 2 + 1) / side)).numpy()
+    assert among(middles, cameras, SPACE.centre).all()
+    point = middles[len(middles) // 2]
+    near = cells & ~cells_among_cameras(SPACE, cameras, side, point[None])
+    assert near[tuple(np.argwhere(cells)[len(middles) // 2])]
+    assert 0 < near.sum() <= (2 * (2 * 2 + 1)) ** 3
+    assert np.ptp(np.argwhere(near), axis=0).max() < 2 * (2 * 2 + 1)
