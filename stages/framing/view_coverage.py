@@ -184,17 +184,23 @@ def cells_among_cameras(space: Space, cameras: Sequence[Camera], side: int, fill
 def among(points: np.ndarray, cameras: Sequence[Camera], middle: np.ndarray) -> np.ndarray:
     """(N,) bool: points (N, 3) that, seen from `middle` (3,), have a camera within AMONG degrees and farther away, while every camera that has them in view
     has them farther away than BEHIND of the depth of `middle`."""
-    out, centres = np.zeros(len(points), bool), np.array([camera.centre for camera in cameras]) - middle
-    away, distance = np.linalg.norm(centres, axis=1), np.linalg.norm(points - middle, axis=1)
-    at = np.flatnonzero(distance < away.max())
-    towards = (points[at] - middle) @ (centres / away[:, None]).T / distance[at, None]
-    at = at[((towards > np.cos(np.radians(AMONG))) & (away > distance[at, None])).any(axis=1)]
-    for camera in cameras:
-        pixels, depth = project(camera, points[at])
-        with np.errstate(invalid="ignore"):
-            inside = np.asarray((depth > 0) & (pixels >= 0).all(1) & (pixels <= (camera.width, camera.height)).all(1))
-        at = at[~(inside & (depth < BEHIND * float((middle - camera.centre) @ camera.forward)))]
-    out[at] = True
+    order, ways = bit_reversed_order(len(cameras)), [camera.centre - middle for camera in cameras]
+    distance = np.linalg.norm(points - middle, axis=1)
+    out, undecided = np.zeros(len(points), bool), np.flatnonzero(distance < max(map(np.linalg.norm, ways)))
+    to, distance = points[undecided] - middle, distance[undecided]
+    for n in order:
+        length = float(np.linalg.norm(ways[n]))
+        close = (distance < length) & (to @ ways[n] > np.cos(np.radians(AMONG)) * length * distance)
+        out[undecided[close]] = True
+        undecided, to, distance = undecided[~close], to[~close], distance[~close]
+    at = np.flatnonzero(out)
+    some = points[at]
+    for camera in (cameras[n] for n in order):
+        depth = (some - camera.centre) @ camera.forward
+        before = np.flatnonzero((depth > 0) & (depth < BEHIND * float((middle - camera.centre) @ camera.forward)))  # cheaper than to project all
+        seen = before[shows(some[before], camera)]
+        out[at[seen]] = False
+        at, some = np.delete(at, seen), np.delete(some, seen, axis=0)
     return out
 
 
