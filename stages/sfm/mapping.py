@@ -93,9 +93,9 @@ def _with_exif_focal(pycolmap: Any, images: Sequence[WorkImage], model: Any) -> 
     for camera, prior in priors:
         for number in camera.focal_length_idxs():
             held.cameras[camera.camera_id].params[number] = prior
-    unknown = {*held.cameras} - {camera.camera_id for camera, _ in priors}
+    fixed = cameras_with_fixed_focal(images, model) | ({*held.cameras} - {camera.camera_id for camera, _ in priors})
     for _ in range(2):  # the first goes far, under a loss of the wide scale that it begins with
-        bundle_adjust(pycolmap, held, unknown, {"refine_focal_length": False})
+        bundle_adjust(pycolmap, held, fixed, {"refine_focal_length": False})
     gain = held.compute_mean_reprojection_error() / model.compute_mean_reprojection_error() - 1
     return held if gain < MIN_ERROR_GAIN * float(np.mean(deviations)) else model
 
