@@ -206,6 +206,7 @@ def _write_images(job: Job, capture: Capture, warn: Any) -> tuple[Capture, list[
 def assign_splits(photos: Sequence[Photo], every: int, warn: Any = lambda text: None) -> list[str]:
     """The split of each photo: the source's where it states validation or test images, else every n-th in sorted order is a test image.
 
+    Fewer than twice n are counted from the middle: the first and the last photograph along an arc show what no other does.
     At least 2 are left for training, whatever the source states.
     """
     given = [photo.split for photo in photos]
@@ -218,7 +219,8 @@ def assign_splits(photos: Sequence[Photo], every: int, warn: Any = lambda text: 
             return splits
         warn(f"The source's split has {splits.count('train')} training images; at least 2 are needed. The split is not used.")
     order = sorted(range(len(photos)), key=lambda index: photos[index].camera.name)
-    test = set(order[::every][: max(0, len(photos) - 2)])
+    first = 0 if len(photos) >= 2 * every else min(every, len(photos)) // 2
+    test = set(order[first::every][: max(0, len(photos) - 2)])
     return ["test" if index in test else "train" for index in range(len(photos))]
 
 

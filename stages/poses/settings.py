@@ -75,7 +75,9 @@ class PosesSettings:
         advanced=True,
     )
     test_every: Annotated[int, Meta(ge=2, le=10**6)] = setting(
-        8, "Every n-th image in sorted order is a test view, unless the source has a split.", advanced=True
+        8,
+        "Every n-th image in sorted order is a test view, unless the source has a split; of fewer than twice n the middle ones are.",
+        advanced=True,
     )
     llff_factor: PositiveInt | Auto = setting("auto", "Downscale factor n of the LLFF images (images_n); auto: the largest images available.", advanced=True)
     frames: Annotated[int, Meta(ge=3, le=10_000)] = setting(
@@ -124,7 +126,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="poses",
-    version=23,
+    version=24,
     settings=PosesSettings,
     needs=(),
     run=ByName("stages.poses.run:run"),

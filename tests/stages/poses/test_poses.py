@@ -198,14 +198,25 @@ def photos(splits: list[str | None]) -> list[Photo]:
     return [Photo(camera, Path(camera.name), split=split) for camera, split in zip(captures.cameras(len(splits)), splits, strict=True)]
 
 
+def held_out(count: int) -> list[int]:
+    """Which of so many photographs in sorted order are test views."""
+    unsplit = photos([None] * count)
+    named = sorted(zip([photo.camera.name for photo in unsplit], assign_splits(unsplit, 8), strict=True))
+    return [index for index, (_, split) in enumerate(named) if split == "test"]
+
+
 def test_splits() -> None:
     assert assign_splits(photos(["train", "train", "test", "val"]), 8) == ["train", "train", "test", "val"]
-    assert assign_splits(photos([None] * 9), 8) == ["test", *["train"] * 7, "test"]
-    assert assign_splits(photos(["train"] * 9), 8) == ["test", *["train"] * 7, "test"], "nothing is held back by the source"
+    assert held_out(17) == [0, 8, 16]
+    assert held_out(16) == [0, 8]
+    assert held_out(15) == [4, 12]
+    assert held_out(9) == [4], "the ends of an arc are not held out"
+    assert assign_splits(photos(["train"] * 9), 8).count("test") == 1, "nothing is held back by the source"
+    assert assign_splits(photos([None] * 3), 8) == ["train", "test", "train"]
     assert assign_splits(photos([None] * 3), 2).count("train") == 2
     assert assign_splits(photos([None] * 2), 8) == ["train"] * 2
     said: list[str] = []
-    assert assign_splits(photos(["test"] * 8 + ["train"]), 8, said.append).count("train") == 7
+    assert assign_splits(photos(["test"] * 8 + ["train"]), 8, said.append).count("train") == 8
     assert "at least 2" in said[0]
     assert assign_splits(photos(["train", "train", "test", None]), 8, said.append)[3] == "train"
     assert "1 images are in none" in said[1]
