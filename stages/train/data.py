@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -160,6 +161,17 @@ def sparse_depth_of(folder: Path, s: Scene, seed: int = 0) -> SparseDepthRays | 
     return found if support is None else _with_support(found, support, scene.views_of(s, "train"), seed)
 
 
+def with_stereo(found: SparseDepthRays, xyz: np.ndarray, own: np.ndarray, other: np.ndarray) -> SparseDepthRays:
+    """With rays to the points of stereo: from the cameras that show them, and from between these and others that do, as of `stereo.stereo_points`."""
+    share = (GOLDEN * np.arange(1, len(xyz) + 1) % 1)[:, None]
+    origins = np.concatenate([own, own + share * (other - own)])
+    offset = np.concatenate([xyz, xyz]) - origins
+    distance = np.linalg.norm(offset, axis=1)
+    apart = distance > MIN_DISTANCE
+    dense = _rays(origins[apart], offset[apart] / distance[apart, None], distance[apart], on_support=False)
+    return replace(_joined(dense, found), of_stereo=len(dense))
+
+
 def _with_support(found: SparseDepthRays, support: Support, views: tuple[View, ...], seed: int) -> SparseDepthRays:
     """With half as many rays of random pixels to the support, as many of each view if it shows so much of it."""
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 7, 0]))
@@ -172,8 +184,14 @@ def _with_support(found: SparseDepthRays, support: Support, views: tuple[View, .
         meets = np.flatnonzero(np.isfinite(distance))[:each]
         parts.append((origins[meets], directions[meets], distance[meets]))
     origins, directions, distance = (np.concatenate(part) for part in zip(*parts, strict=True))
-    own = _rays(origins, directions, distance, on_support=True)
-    return SparseDepthRays(**{name: np.concatenate([values, getattr(own, name)]) for name, values in vars(found).items()})
+    return _joined(found, _rays(origins, directions, distance, on_support=True))
+
+
+def _joined(first: SparseDepthRays, second: SparseDepthRays) -> SparseDepthRays:
+    origins, directions, distance, on_support = (
+        np.concatenate([getattr(first, name), getattr(second, name)]) for name in ("origins", "directions", "distance", "on_support")
+    )
+    return SparseDepthRays(origins, directions, distance, on_support)
 
 
 def _rays(origins: np.ndarray, directions: np.ndarray, distance: np.ndarray, *, on_support: bool) -> SparseDepthRays:
