@@ -12,14 +12,14 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from efficientnerf.backends.numba.stereo import begin_planes, confirm_depths, improve_planes, quads_of
+from efficientnerf.backends.numba.stereo import WORST, confirm_depths, improve_planes, quads_of
 from efficientnerf.geometry.cameras import Camera, project, resized
 
 # docs/experiments/stereo.md
 PIXELS = 320 * 240  # of a picture, at most; patches of larger ones would show less
 SOURCES = 5
 ROUNDS = 4, 2  # of the search at half size, and at full size
-WORST = 0.5  # cost of a patch that counts: 1 less the normalised cross-correlation
+GOOD = 0.5  # cost of a patch that counts, at most: 1 less the normalised cross-correlation
 RETURN = 1.0  # pixels within which a pixel comes back by another photograph's depth
 ANGLE, NARROWER, WIDER = 10.0, 4.0, 15.0  # degrees between two views of a point: the best, and how fast it counts less below and above
 NEAREST, FARTHEST = 1.5, 1e-3  # times the greatest inverse depth of sparse points (their 98th percentile): the range that is searched
@@ -112,7 +112,7 @@ def dense_points(pictures: Sequence[Picture], sources: np.ndarray, xyz: np.ndarr
         points = (xyz[seen[number]] - picture.centre) @ picture.rotation
         found, cost = search.planes(number, _enlarged(planes[number], picture.grey.shape), _range(points), ROUNDS[1])
         planes[number] = np.empty((0, 0, 3), np.float32)
-        inverses.append(np.where(cost <= WORST, found[..., 0], np.float32(0)))
+        inverses.append(np.where(cost <= GOOD, found[..., 0], np.float32(0)))
         costs.append(cost)
     together = np.concatenate([inverse.ravel() for inverse in inverses])
     for number, picture in enumerate(pictures):
@@ -174,23 +174,21 @@ class _Search:
         return np.array([turn for turn, _ in each], np.float32).reshape(-1, 3, 3), np.array([shift for _, shift in each], np.float32).reshape(-1, 3)
 
     def planes(self, number: int, guess: np.ndarray, limits: tuple[np.float32, np.float32], rounds: int) -> tuple[np.ndarray, np.ndarray]:
-        """Planes (H, W, 3) of a picture and their costs (H, W)."""
+        """Planes (H, W, 3) of a picture and their costs (H, W); `guess` becomes them."""
         picture, chosen = self.pictures[number], self.sources[number]
-        planes, cost = np.zeros_like(guess), np.full(guess.shape[:2], 2, np.float32)
+        cost = np.full(guess.shape[:2], WORST, np.float32)
         nearest, farthest = limits
-        if nearest == 0 or not len(chosen):
-            return planes, cost
-        others = *self._maps(number), self.quads, self.starts[chosen], self.shapes[chosen]
-        grey, focal = picture.grey.astype(np.float32), np.float32(picture.matrix[0, 0])
-        begin_planes(grey, guess, nearest, farthest, 16 * number, *others, planes, cost)
-        for turn in range(rounds):
-            improve_planes(grey, nearest, farthest, focal, 16 * number + turn + 1, *others, planes, cost)
-        return planes, cost
+        if nearest > 0 and len(chosen):
+            others = *self._maps(number), self.quads, self.starts[chosen], self.shapes[chosen]
+            grey, focal = picture.grey.astype(np.float32), np.float32(picture.matrix[0, 0])
+            for turn in range(rounds):
+                improve_planes(grey, nearest, farthest, focal, 16 * number + turn, *others, guess, cost)
+        return guess, cost
 
     def confirmed(self, number: int, inverse: np.ndarray, cost: np.ndarray, inverses: np.ndarray) -> Any:
         """(H, W) int32: bits of the sources whose own depths confirm those of a picture."""
         chosen, out = self.sources[number], np.zeros(inverse.shape, np.int32)
         if len(chosen):
             others = *self._maps(number), *self._maps(number, back=True), inverses, self.starts[chosen], self.shapes[chosen]
-            confirm_depths(inverse, cost, np.float32(WORST), np.float32(RETURN), *others, out)
+            confirm_depths(inverse, cost, np.float32(GOOD), np.float32(RETURN), *others, out)
         return out

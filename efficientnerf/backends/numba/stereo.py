@@ -25,22 +25,23 @@ LEAST_DEVIATION = 2.0  # of 255: deviation of a patch from a gradient, below whi
 LEAST_WEIGHTED = 0.5  # of 255: weighted deviation of a patch, below which its noise decides
 COLOUR, SPREAD = 24.0, 5.0  # of a patch's weights: of 255, pixels
 AROUND = ((-1, 0), (1, 0), (0, -1), (0, 1), (-3, 0), (3, 0), (0, -3), (0, 3))  # neighbours of the other colour
-RANDOM = 3  # planes that are tried in each round: near the best one, nearer, anywhere
+RANDOM = 3  # planes that are tried in each round
 STEEPEST = 3.0  # tangent of a random plane's angle to the picture
 WORST = 2.0  # of costs, which are 1 - the normalised cross-correlation
 LEAST_DEPTH = np.float32(1e-6)  # in units of the reference's depth
 _ZERO = np.float32(0)
+_LOW = np.uint64(2**32 - 1)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _uniform(seed, x, y, k):
-    """A number from 0 to 1 for a pixel (Jarzynski and Olano 2020, PCG hash)."""
-    state = np.uint32(x) * np.uint32(1973) + np.uint32(y) * np.uint32(9277) + np.uint32(k) * np.uint32(26699) + np.uint32(seed) * np.uint32(362437)
+    """A number from 0 to 1 for a pixel (Jarzynski and Olano 2020, PCG hash). numba multiplies uint32 as uint64."""
+    state = np.uint64(x * 1973 + y * 9277 + k * 26699 + seed * 362437) & _LOW
     for _ in range(2):
-        state = state * np.uint32(747796405) + np.uint32(2891336453)
-        word = ((state >> ((state >> np.uint32(28)) + np.uint32(4))) ^ state) * np.uint32(277803737)
-        state = (word >> np.uint32(22)) ^ word
-    return np.float32(state >> np.uint32(8)) * np.float32(1 / 2**24)
+        state = (state * np.uint64(747796405) + np.uint64(2891336453)) & _LOW
+        word = (((state >> ((state >> np.uint64(28)) + np.uint64(4))) ^ state) * np.uint64(277803737)) & _LOW
+        state = (word >> np.uint64(22)) ^ word
+    return np.float32(state >> np.uint64(8)) * np.float32(1 / 2**24)
 
 
 def quads_of(grey: np.ndarray) -> np.ndarray:
@@ -132,39 +133,40 @@ def _cost(x, y, inverse, along, down, patch, deviation, maps, shifts, quads, sta
     return best + np.float32(0.5) * min(second - best, np.float32(ALONE))
 
 
-@numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
-def begin_planes(grey, guess, nearest, farthest, seed, maps, shifts, quads, starts, shapes, planes, cost):
-    """Planes (H, W, 3) and their cost (H, W): of `guess` (H, W, 3), whose inverse depths are zero where there is none, or random ones that agree better.
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _of_neighbour(planes, cost, x, y, k):
+    """The plane of the k-th neighbour at a pixel; zeros where it has none that fits."""
+    i, j = y + AROUND[k][1], x + AROUND[k][0]
+    if i < 0 or j < 0 or i >= len(planes) or j >= planes.shape[1] or cost[i, j] >= np.float32(1):
+        return _ZERO, _ZERO, _ZERO
+    along, down = planes[i, j, 1], planes[i, j, 2]
+    return planes[i, j, 0] + along * np.float32(x - j) + down * np.float32(y - i), along, down
 
-    grey      (H, W) float32, 0 to 255
-    nearest   greatest inverse depth; farthest: the least one
-    maps      (S, 3, 3) float32, shifts (S, 3): of pixels of the reference (x, y, 1) with the inverse depth w to a source's, maps @ pixel + shifts * w
-    quads     int32 of all pictures' pixels, see `quads_of`; starts (S,), shapes (S, 2) int64 of the sources' in it
-    """
-    height, width = grey.shape
-    texels = pointer(quads)
-    for y in numba.prange(height):
-        patch = _empty_patch()
-        address = pointer(patch)
-        for x in range(width):
-            deviation = _reference_patch(grey, x, y, patch)
-            planes[y, x, :] = guess[y, x, :]
-            cost[y, x] = np.float32(WORST)
-            if deviation < np.float32(LEAST_WEIGHTED):
-                continue
-            if guess[y, x, 0] > np.float32(0):
-                cost[y, x] = _cost(x, y, guess[y, x, 0], guess[y, x, 1], guess[y, x, 2], address, deviation, maps, shifts, texels, starts, shapes)
-            inverse = farthest + (nearest - farthest) * _uniform(seed, x, y, 0)
-            other = _cost(x, y, inverse, np.float32(0), np.float32(0), address, deviation, maps, shifts, texels, starts, shapes)
-            if other < cost[y, x]:
-                cost[y, x] = other
-                planes[y, x, 0], planes[y, x, 1], planes[y, x, 2] = inverse, np.float32(0), np.float32(0)
-        hold((patch,))
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _random(k, x, y, w, wx, wy, nearest, farthest, focal, seed):
+    """The k-th random plane of a pixel: two near its own, the second of them nearer, and one anywhere."""
+    two, one = np.float32(2), np.float32(1)
+    a, b, c = _uniform(seed, x, y, 3 * k), two * _uniform(seed, x, y, 3 * k + 1) - one, two * _uniform(seed, x, y, 3 * k + 2) - one
+    if k == RANDOM - 1:
+        w = farthest + (nearest - farthest) * a
+        steep = np.float32(STEEPEST) * w / focal
+        return w, steep * b, steep * c
+    reach = np.float32(0.25) if k == 0 else np.float32(0.0625)
+    steep = reach * np.float32(STEEPEST) * w / focal
+    return w * (one + np.float32(0.1) * reach * (two * a - one)), wx + steep * b, wy + steep * c
 
 
 @numba.njit(cache=True, parallel=PRANGE, error_model="numpy")
 def improve_planes(grey, nearest, farthest, focal, seed, maps, shifts, quads, starts, shapes, planes, cost):
-    """One round over the pixels of both colours, in place; `focal` is the reference's in pixels, `seed` another in each round; else as of `begin_planes`."""
+    """One round over the pixels of both colours, in place: planes (H, W, 3) and what they cost (H, W) float32, `WORST` where that is not known yet.
+
+    grey      (H, W) float32, 0 to 255
+    nearest   greatest inverse depth; farthest: the least one; focal: focal length in pixels
+    seed      of random planes, another in each round
+    maps      (S, 3, 3) float32, shifts (S, 3): of pixels of the reference (x, y, 1) with the inverse depth w to a source's, maps @ pixel + shifts * w
+    quads     int32 of all pictures' pixels, see `quads_of`; starts (S,), shapes (S, 2) int64 of the sources' in it
+    """
     height, width = grey.shape
     texels = pointer(quads)
     for colour in range(2):
@@ -175,38 +177,21 @@ def improve_planes(grey, nearest, farthest, focal, seed, maps, shifts, quads, st
                 deviation = _reference_patch(grey, x, y, patch)
                 if deviation < np.float32(LEAST_WEIGHTED):
                     continue
-                w, gx, gy, least = planes[y, x, 0], planes[y, x, 1], planes[y, x, 2], cost[y, x]
-                for k in range(len(AROUND)):
-                    i, j = y + AROUND[k][1], x + AROUND[k][0]
-                    if i < 0 or j < 0 or i >= height or j >= width or cost[i, j] >= np.float32(1):
-                        continue
-                    ow = planes[i, j, 0] + planes[i, j, 1] * np.float32(x - j) + planes[i, j, 2] * np.float32(y - i)
-                    ox, oy = planes[i, j, 1], planes[i, j, 2]
-                    if ow < farthest or ow > nearest:
-                        continue
-                    other = _cost(x, y, ow, ox, oy, address, deviation, maps, shifts, texels, starts, shapes)
-                    if other < least:
-                        w, gx, gy, least = ow, ox, oy, other
-                width_of = np.float32(1)
-                for k in range(RANDOM):
-                    draw = 3 * k + 1
-                    r0, r1, r2 = _uniform(seed, x, y, draw), _uniform(seed, x, y, draw + 1), _uniform(seed, x, y, draw + 2)
-                    two = np.float32(2)
-                    if k == RANDOM - 1:
-                        ow = farthest + (nearest - farthest) * r0
-                        steep = np.float32(STEEPEST) * ow / focal
-                        ox, oy = steep * (two * r1 - np.float32(1)), steep * (two * r2 - np.float32(1))
+                w, wx, wy, least = planes[y, x, 0], planes[y, x, 1], planes[y, x, 2], cost[y, x]
+                for k in range(0 if least == np.float32(WORST) else 1, 1 + len(AROUND) + RANDOM):
+                    if k == 0:
+                        other = w, wx, wy
+                    elif k <= len(AROUND):
+                        other = _of_neighbour(planes, cost, x, y, k - 1)
                     else:
-                        width_of *= np.float32(0.25)
-                        ow = w * (np.float32(1) + np.float32(0.1) * width_of * (two * r0 - np.float32(1)))
-                        steep = width_of * np.float32(STEEPEST) * w / focal
-                        ox, oy = gx + steep * (two * r1 - np.float32(1)), gy + steep * (two * r2 - np.float32(1))
-                    if ow < farthest or ow > nearest:
+                        other = _random(k - 1 - len(AROUND), x, y, w, wx, wy, nearest, farthest, focal, seed)
+                    if other[0] < farthest or other[0] > nearest:
                         continue
-                    other = _cost(x, y, ow, ox, oy, address, deviation, maps, shifts, texels, starts, shapes)
-                    if other < least:
-                        w, gx, gy, least = ow, ox, oy, other
-                planes[y, x, 0], planes[y, x, 1], planes[y, x, 2] = w, gx, gy
+                    found = _cost(x, y, other[0], other[1], other[2], address, deviation, maps, shifts, texels, starts, shapes)
+                    if found < least:
+                        least = found
+                        w, wx, wy = other
+                planes[y, x, 0], planes[y, x, 1], planes[y, x, 2] = w, wx, wy
                 cost[y, x] = least
             hold((patch,))
 
@@ -218,7 +203,7 @@ def confirm_depths(inverse, cost, worst, apart, maps, shifts, backs, back_shifts
     A pixel goes to the source by its depth and back by the source's: it has to come back within `apart` pixels. Costs beyond `worst` confirm nothing.
 
     inverse      (H, W) float32 inverse depths of the reference, cost (H, W)
-    maps, shifts to the sources as of `begin_planes`; backs, back_shifts from them
+    maps, shifts to the sources as of `improve_planes`; backs, back_shifts from them
     inverses     float32 of all pictures: inverse depths, zero where they are not known
     """
     height, width = inverse.shape
