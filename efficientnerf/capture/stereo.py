@@ -23,6 +23,7 @@ GOOD = 0.5  # cost of a patch that counts, at most: 1 less the normalised cross-
 RETURN = 1.0  # pixels within which a pixel comes back by another photograph's depth
 ANGLE, NARROWER, WIDER = 10.0, 4.0, 15.0  # degrees between two views of a point: the best, and how fast it counts less below and above
 NEAREST, FARTHEST = 1.5, 1e-3  # times the greatest inverse depth of sparse points (their 98th percentile): the range that is searched
+OUTSIDE = -1e6  # pixels: of what a lens does not show
 FEWEST = 10  # sparse points that a photograph has to observe
 
 
@@ -49,7 +50,7 @@ class Picture:
 
 
 def undistorted(grey: np.ndarray, camera: Camera, most: int = PIXELS) -> Picture:
-    """A photograph (H, W) uint8, reduced to at most so many pixels. What the pinhole camera shows beyond its borders continues these."""
+    """A photograph (H, W) uint8, reduced to at most so many pixels. What the pinhole camera shows beyond its borders is black."""
     scale = min(1.0, (most / grey.size) ** 0.5)
     width, height = (max(2, round(length * scale)) for length in (camera.width, camera.height))
     small, reduced = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), resized(camera, width, height)
@@ -57,9 +58,10 @@ def undistorted(grey: np.ndarray, camera: Camera, most: int = PIXELS) -> Picture
     matrix = np.array([[lens["fx"], 0, lens["cx"] - 0.5], [0, lens["fy"], lens["cy"] - 0.5], [0, 0, 1]])
     rotation = camera.world_from_camera[:3, :3]
     pixels = np.stack([*np.meshgrid(np.arange(width), np.arange(height)), np.ones((height, width))], axis=-1).reshape(-1, 3)
-    seen = project(reduced, pixels @ np.linalg.inv(matrix).T @ rotation.T + camera.centre)[0].astype(np.float32) - 0.5
+    seen = project(reduced, pixels @ np.linalg.inv(matrix).T @ rotation.T + camera.centre)[0] - 0.5
+    seen = np.nan_to_num(seen, nan=OUTSIDE).clip(OUTSIDE, -OUTSIDE).astype(np.float32)
     across, down = (np.ascontiguousarray(axis.reshape(height, width)) for axis in seen.T)
-    grey = cv2.remap(small, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    grey = cv2.remap(small, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     return Picture(grey, matrix, rotation, np.asarray(camera.centre))
 
 

@@ -14,6 +14,7 @@ from stages.io import scene
 from stages.io.scene import Scene, View
 
 MOST_PHOTOGRAPHS = 120  # that are compared: of more, where stereo is needed least, evenly chosen ones
+MOST_SPARSE = 2**17  # sparse points that say where to search
 MOST_PIXELS = 5_000_000  # of all pictures: 17 s on two cores
 PIXELS_A_SECOND = 24_000  # of a time budget: 8 % of it on two cores
 MOST_POINTS = 2**19  # that are used; as many of each photograph
@@ -38,6 +39,7 @@ def stereo_points(
     used = np.flatnonzero(seen.any(axis=0) & np.isfinite(xyz).all(axis=1))
     if len(used) < FEWEST:
         return None
+    used = used[:: -(-len(used) // MOST_SPARSE)]
     xyz, seen = xyz[used], seen[:, used]
     rows = {view.image: number for number, view in enumerate(views)}
     budget = resolved(settings.time_budget)
@@ -63,13 +65,11 @@ def stereo_points(
 
 
 def _picture(pixels: Pixels, row: int, view: View, most: int) -> tuple[Picture, np.ndarray]:
-    """A view without distortion, of at most so many pixels, and which of them (H, W) masks and alpha channels keep."""
+    """A view without distortion, of at most so many pixels, and which of them (H, W) the photograph shows, and masks and alpha channels keep."""
     begin, end, shape = int(pixels.offsets[row]), int(pixels.offsets[row + 1]), (view.camera.height, view.camera.width)
     image = np.asarray(pixels.images[begin:end]).reshape(*shape, -1)
     usable = pixels.usable_of(row)
     if image.shape[-1] == 4:
         usable = usable & (image[..., 3] > 127)
     picture = undistorted(cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_RGB2GRAY), view.camera, most)
-    if usable.all():
-        return picture, np.ones(picture.grey.shape, bool)
     return picture, undistorted(np.where(usable, np.uint8(255), np.uint8(0)), view.camera, most).grey == 255

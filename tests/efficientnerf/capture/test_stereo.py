@@ -84,6 +84,16 @@ def test_an_undistorted_picture_is_that_of_a_pinhole_camera() -> None:
     assert undistorted(np.zeros((1200, 900), np.uint8), large).grey.size <= 1.01 * PIXELS
 
 
+@pytest.mark.parametrize("bend", [0.4, -0.6])
+def test_what_the_lens_does_not_show_is_black(bend: float) -> None:
+    """With 0.4 the pinhole camera's corners lie beyond the picture, with -0.6 where the lens's model folds back."""
+    camera = cameras()[0]
+    bent = Camera("bent", WIDTH, HEIGHT, "SIMPLE_RADIAL", (70.0, WIDTH / 2, HEIGHT / 2, bend), camera.world_from_camera)
+    grey = undistorted(np.full((HEIGHT, WIDTH), 200, np.uint8), bent).grey
+    assert (grey[[0, 0, -1, -1], [0, -1, 0, -1]] == 0).all()
+    assert grey[HEIGHT // 2, WIDTH // 2] == 200
+
+
 @pytest.mark.parametrize("half", [False, True])
 def test_pixels_go_to_other_pictures_as_points_do(half: bool) -> None:
     one, other = (undistorted(photograph(camera), camera) for camera in cameras(2))
