@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -168,7 +169,7 @@ def with_stereo(found: SparseDepthRays, xyz: np.ndarray, own: np.ndarray, other:
     distance = np.linalg.norm(offset, axis=1)
     apart = distance > MIN_DISTANCE
     dense = _rays(origins[apart], offset[apart] / distance[apart, None], distance[apart], on_support=False)
-    return _joined(dense, found)
+    return replace(_joined(dense, found), of_stereo=len(dense))
 
 
 def _with_support(found: SparseDepthRays, support: Support, views: tuple[View, ...], seed: int) -> SparseDepthRays:

@@ -99,7 +99,7 @@ def trained(job: Job) -> bool:
 
 
 def sparse_depth(job: Job, folder: Path, s: Scene, t: Trainer, pixels: Pixels, views: tuple[View, ...]) -> SparseDepthRays | None:
-    """Rays to sparse points, and to those that stereo finds. A message says where there are points and none can be used."""
+    """Rays to sparse points, and with `stereo` to those that it finds. A message says where there are points and none can be used."""
     settings = t.model.settings
     found = sparse_depth_of(folder, s, settings.seed)
     if found is None and s.points and settings.sparse_depth_loss_weight > 0:
@@ -107,7 +107,7 @@ def sparse_depth(job: Job, folder: Path, s: Scene, t: Trainer, pixels: Pixels, v
     if found is not None and found.on_support.any():
         job.say(f"the subject stands on a plane, where rays end: {int(found.on_support.sum())} rays to it are trained on")
     weight = sparse_depth_weight(settings.sparse_depth_loss_weight, t.schedule.fraction(t.step)) if t.model.space.unbounded else 0.0
-    if found is None or weight <= 0:
+    if found is None or weight <= 0 or not settings.stereo:
         return found
     dense = stereo_points(folder, s, pixels, views, settings, lambda share: job.reached(share, 1.0, "comparing photographs"))
     if dense is None:

@@ -8,16 +8,18 @@ import numpy as np
 import pytest
 
 from efficientnerf.training.pixels import Pixels
+from efficientnerf.training.sparse_depth import STEREO_ENDS, aimed_rays
 from pipeline.errors import Interrupted
 from stages.io import scene as scenes
 from stages.io.capture import SparsePoints
 from stages.io.png import write_png
 from stages.io.scene import Scene, View
+from stages.train import run as train
 from stages.train import stereo
 from stages.train.data import pixels_of, sparse_depth_of, with_stereo
 from tests.efficientnerf.balls import settings
 from tests.efficientnerf.capture.textured import PARALLAX, cameras, off, photograph, sparse
-from tests.stages.balls import ORBIT, SIMILARITY
+from tests.stages.balls import ORBIT, SIMILARITY, job
 
 BOUNDS = np.array([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]])
 
@@ -100,7 +102,7 @@ def test_too_few_sparse_points_give_none_and_a_stop_is_heard(tmp_path: Path) -> 
     assert stereo.stereo_points(tmp_path, s, pixels, views, settings(), stop) is None
 
 
-def test_rays_to_points_of_stereo_come_with_those_to_sparse_points(tmp_path: Path) -> None:
+def test_rays_to_points_of_stereo_come_first_and_end_early(tmp_path: Path) -> None:
     s, pixels, views = made(tmp_path)
     alone = sparse_depth_of(tmp_path, s)
     assert alone is not None
@@ -113,3 +115,17 @@ def test_rays_to_points_of_stereo_come_with_those_to_sparse_points(tmp_path: Pat
     line = np.cross(both.origins[len(own) : 2 * len(own)] - own, other - own)
     assert np.abs(line).max() < 1e-5, "the other half begins between two cameras"
     np.testing.assert_array_equal(both.distance[2 * len(xyz) :], alone.distance)
+    rng = np.random.default_rng(0)
+    early, late = (aimed_rays(both, 500, fraction, rng).distance for fraction in (0.0, STEREO_ENDS))
+    assert not np.isin(early, alone.distance).all()
+    assert np.isin(late, alone.distance).all()
+
+
+@pytest.mark.parametrize("stereo_on", [False, True])
+def test_training_compares_photographs_where_it_is_asked_to(tmp_path: Path, stereo_on: bool) -> None:
+    (tmp_path / "poses").mkdir()
+    made(tmp_path / "poses")
+    events: list[dict[str, Any]] = []
+    few = settings(iterations=3, sample_batch_size=1024, occupancy_warmup_steps=2, preview_every=5, stereo=stereo_on)
+    train.run(job(tmp_path, few, poses=tmp_path / "poses", events=events))
+    assert any("stereo finds" in str(event.get("text")) for event in events) == stereo_on
