@@ -90,7 +90,6 @@ class DensePoints:
 
     xyz: np.ndarray  # (N, 3) float64
     pixel: np.ndarray  # (N, 2) int64, x and y in its picture
-    photograph: np.ndarray  # (N,) int64
     confirmed: np.ndarray  # (N, S) bool, by which of its sources
 
 
@@ -123,7 +122,7 @@ def dense_points(pictures: Sequence[Picture], sources: np.ndarray, xyz: np.ndarr
         towards = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(picture.matrix).T
         placed = towards / inverses[number][y, x, None] @ picture.rotation.T + picture.centre
         by = (confirmed[y, x, None] >> np.arange(sources.shape[1])) & 1 > 0
-        yield DensePoints(placed, np.stack([x, y], axis=-1), np.full(len(x), number), by)
+        yield DensePoints(placed, np.stack([x, y], axis=-1), by)
 
 
 def _range(points: np.ndarray) -> tuple[np.float32, np.float32]:

@@ -14,7 +14,7 @@ from efficientnerf.training import loop
 from efficientnerf.training.loop import Trainer
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.readback import AsyncOccupancy
-from efficientnerf.training.sparse_depth import SparseDepthRays, sparse_depth_weight
+from efficientnerf.training.sparse_depth import STEREO_ENDS, SparseDepthRays
 from pipeline.stage import Job
 from stages.artifacts import TrainOutputs
 from stages.compiling import clock, running_kernels
@@ -106,11 +106,13 @@ def sparse_depth(job: Job, folder: Path, s: Scene, t: Trainer, pixels: Pixels, v
         job.say("no sparse point is in front of enough of the training cameras that observe it; train.sparse_depth_loss_weight has no effect")
     if found is not None and found.on_support.any():
         job.say(f"the subject stands on a plane, where rays end: {int(found.on_support.sum())} rays to it are trained on")
-    weight = sparse_depth_weight(settings.sparse_depth_loss_weight, t.schedule.fraction(t.step)) if t.model.space.unbounded else 0.0
-    if found is None or weight <= 0 or not settings.stereo:
+    if not settings.stereo or t.schedule.fraction(t.step) >= STEREO_ENDS:
         return found
-    dense = stereo_points(folder, s, pixels, views, settings, lambda share: job.reached(share, 1.0, "comparing photographs"))
-    if dense is None:
+    dense = None
+    if found is not None and settings.sparse_depth_loss_weight > 0 and t.model.space.unbounded:
+        dense = stereo_points(folder, s, pixels, views, settings, lambda share: job.reached(share, 1.0, "comparing photographs"))
+    if found is None or dense is None:
+        job.say("train.stereo has no effect: it is for unbounded scenes with sparse points and a depth loss")
         return found
     job.say(f"stereo finds {len(dense[0])} points that two photographs agree on")
     return with_stereo(found, *dense)

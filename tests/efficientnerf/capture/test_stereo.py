@@ -19,8 +19,7 @@ def found(pictures: list[Picture], made: list[Camera]) -> list[DensePoints]:
 def test_points_lie_on_the_surfaces_also_where_there_are_no_sparse_points() -> None:
     made = cameras()
     dense = found([undistorted(photograph(camera), camera) for camera in made], made)
-    for number, each in enumerate(dense):
-        assert (each.photograph == number).all()
+    for each in dense:
         assert len(each.xyz) > 0.6 * WIDTH * HEIGHT
         assert np.percentile(off(each.xyz), 50) < PARALLAX / 3
         assert np.percentile(off(each.xyz), 95) < 1.5 * PARALLAX

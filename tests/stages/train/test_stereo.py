@@ -129,3 +129,13 @@ def test_training_compares_photographs_where_it_is_asked_to(tmp_path: Path, ster
     few = settings(iterations=3, sample_batch_size=1024, occupancy_warmup_steps=2, preview_every=5, stereo=stereo_on)
     train.run(job(tmp_path, few, poses=tmp_path / "poses", events=events))
     assert any("stereo finds" in str(event.get("text")) for event in events) == stereo_on
+
+
+def test_stereo_without_sparse_points_is_reported_to_have_no_effect(tmp_path: Path) -> None:
+    (tmp_path / "poses").mkdir()
+    s, _, _ = made(tmp_path / "poses")
+    scenes.save(replace(s, points=False), tmp_path / "poses")
+    events: list[dict[str, Any]] = []
+    few = settings(iterations=3, sample_batch_size=1024, occupancy_warmup_steps=2, preview_every=5, stereo=True)
+    train.run(job(tmp_path, few, poses=tmp_path / "poses", events=events))
+    assert any("train.stereo has no effect" in str(event.get("text")) for event in events)
