@@ -12,7 +12,8 @@ import os
 import time
 from importlib import import_module
 
-BEGAN = time.time()  # before any other module of this package was read: `efficientnerf.backends.numba.runtime`
+# Before any other module of this package was read: `efficientnerf.backends.numba.runtime`. Files carry the time of the last clock tick, up to 10 ms ago.
+BEGAN = time.time() - 0.02
 
 # onnxruntime, wherever it is imported, else keeps an identifier of the device in the user's cache and sends to its maker what it is used for.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
