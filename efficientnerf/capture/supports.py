@@ -166,7 +166,7 @@ def opaque_support(points: np.ndarray, cameras: np.ndarray, origins: np.ndarray,
     points at `lengths` (R,) go on through it."""
     if len(points) < MIN_ON_SUPPORT:
         return None
-    size = 2 * float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+    size = size_of(points)
     broadest: tuple[float, Support] | None = None
     for _ in range(MAX_SUPPORTS + 1):
         if (plane := level_plane(points, cameras, np.array([0.0, 0.0, 1.0]))) is None:
@@ -178,15 +178,26 @@ def opaque_support(points: np.ndarray, cameras: np.ndarray, origins: np.ndarray,
         area = float(ConvexHull(on[:, :2]).volume)
         if broadest is None or area > broadest[0]:
             broadest = area, Support(*plane, Delaunay(on[:, :2]), np.zeros((0, 2)))
-    if broadest is None:
-        return None
-    distance = broadest[1].distances(origins, directions)
+    return None if broadest is None else unless_seen_through(broadest[1], size, origins, directions, lengths)
+
+
+def unless_seen_through(support: Support, size: float, origins: np.ndarray, directions: np.ndarray, lengths: np.ndarray) -> Support | None:
+    """A support with holes where some rays (R, 3) to sparse points at `lengths` (R,) go on through it; None where many do.
+
+    size  of the subject
+    """
+    distance = support.distances(origins, directions)
     meets = np.isfinite(distance)
     goes_on = np.flatnonzero(meets)[lengths[meets] > distance[meets] * (1 + SLACK) + FLAT * size]
     if len(goes_on) > MAX_SEEN_THROUGH * meets.sum():
         return None
     ways = [origins[goes_on, :2] + to[goes_on, None] * directions[goes_on, :2] for to in (distance, lengths)]
-    return replace(broadest[1], holes=np.concatenate(ways), around=HOLE * size)
+    return replace(support, holes=np.concatenate(ways), around=HOLE * size)
+
+
+def size_of(points: np.ndarray) -> float:
+    """About how large a subject of sparse points (N, 3) is."""
+    return 2 * float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
 
 
 def _axes_across(normal: np.ndarray) -> np.ndarray:

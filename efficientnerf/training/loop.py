@@ -150,7 +150,7 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
                 open_cells(m.voxels, t.closed)
                 t.closed = None
             count = count if readback is None else graphs.rays(count)
-            inputs = drawn_step(learner, sparse_depth if weight > 0 else None, plain, count, fraction, rng, crop=number <= settings.precrop_steps)
+            inputs = drawn_step(learner, sparse_depth if weight > 0 else None, plain, count, rng, crop=number <= settings.precrop_steps)
             aimed = 0 if inputs.aimed is None else len(inputs.aimed.distance)
             rays = len(inputs.rays.pixel) + aimed
             # Aimed rays begin closer to the camera, and end farther away.

@@ -90,13 +90,8 @@ class TrainSettings:
     )
     sparse_depth_loss_weight: NonNegative = setting(
         0.1,
-        "Weight of the depth loss at the sparse points (DS-NeRF) and on the floor or table that they show; it falls to zero over the first half of the"
-        " steps.",
-        advanced=True,
-    )
-    stereo: bool = setting(
-        False,
-        "Find depths of photographs by stereo, and train on these too for the first quarter of the steps: for surroundings that two or three photographs show.",
+        "Weight of the depth loss at the sparse points (DS-NeRF) and on the floor or table that they, or else photographs that agree along it, show; it"
+        " falls to zero over the first half of the steps.",
         advanced=True,
     )
     plain_loss_weight: NonNegative = setting(

@@ -14,7 +14,6 @@ from efficientnerf.training.losses import mean_over
 # docs/experiments/losses.md
 RAYS_PER_RAY = 8  # one ray to a sparse point for so many rays of pixels
 POINTS_PER_SUPPORT_RAY = 4
-STEREO_ENDS = 0.25  # fraction of the schedule from which points of stereo, which are less exact than sparse ones, have no rays
 WIDTH = 2.0  # coarse intervals on either side of a sparse point that count as at the point
 
 
@@ -27,7 +26,6 @@ class SparseDepthRays:
     directions: np.ndarray
     distance: np.ndarray  # (A,) float32, to the point
     on_support: np.ndarray  # (A,) bool, those last: the point is on the plane that the subject stands on, and something may stand before it
-    of_stereo: int = 0  # how many of the first rays are to points of stereo
 
     def __len__(self) -> int:
         return len(self.distance)
@@ -53,16 +51,13 @@ class AimedRays(NamedTuple):
         return self.origins, self.directions, 0.1 * self.distance, 4 * self.distance, self.offset, torch.full_like(self.directions, UNSEEN)
 
 
-def aimed_rays(rays: SparseDepthRays, count: int, fraction: float, rng: np.random.Generator) -> AimedRays:
-    """`count` random rays to sparse points, at a fraction of the schedule; as many to points of stereo at first, and a quarter as many to the support, if
-    there are some."""
+def aimed_rays(rays: SparseDepthRays, count: int, rng: np.random.Generator) -> AimedRays:
+    """`count` random rays to sparse points, and a quarter as many to the support, if there is one."""
     points = int(np.count_nonzero(~rays.on_support))
-    pick = rng.integers(rays.of_stereo, points, size=count)
-    if rays.of_stereo and fraction < STEREO_ENDS:  # most of these are on large surfaces, and few on the subject's edges
-        pick = np.concatenate([rng.integers(rays.of_stereo, size=count), pick])
+    pick = rng.integers(points, size=count)
     if points < len(rays):
         pick = np.concatenate([pick, rng.integers(points, len(rays), size=max(1, count // POINTS_PER_SUPPORT_RAY))])
-    count = len(pick)
+        count = len(pick)
     return AimedRays(rays.origins[pick], rays.directions[pick], rays.distance[pick], rays.on_support[pick], rng.random(count, np.float32))
 
 

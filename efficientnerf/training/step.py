@@ -96,11 +96,11 @@ def drawn_rays(
 
 
 def drawn_step(
-    learner: Learner, sparse_depth: SparseDepthRays | None, plain: PlainDiscs | None, count: int, fraction: float, rng: np.random.Generator, *, crop: bool
+    learner: Learner, sparse_depth: SparseDepthRays | None, plain: PlainDiscs | None, count: int, rng: np.random.Generator, *, crop: bool
 ) -> StepInputs:
-    """Rays through `count` pixels, as `drawn_rays`, and rays to sparse points, where there are some, at a fraction of the schedule."""
+    """Rays through `count` pixels, as `drawn_rays`, and rays to sparse points, where there are some."""
     rays, triples = drawn_rays(learner.model, learner.pixels, count, rng, crop=crop, plain=plain)
-    aimed = None if sparse_depth is None else aimed_rays(sparse_depth, max(1, count // RAYS_PER_RAY), fraction, rng)
+    aimed = None if sparse_depth is None else aimed_rays(sparse_depth, max(1, count // RAYS_PER_RAY), rng)
     return StepInputs(rays, None if learner.exposure is None else places(on_host(learner.pixels), rays.pixel), aimed, triples)
 
 

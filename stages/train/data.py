@@ -1,13 +1,14 @@
 """The training data of a scene: pixels with their rays, near and far planes, and sparse depth."""
 
 import math
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import Delaunay
 
-from efficientnerf.capture.supports import Support, opaque_support
+from efficientnerf.capture.plane_sweep import SweptPlane
+from efficientnerf.capture.supports import Support, opaque_support, size_of, unless_seen_through
 from efficientnerf.geometry.cameras import rays
 from efficientnerf.model import Model
 from efficientnerf.training.pixels import PixelRows, Pixels
@@ -122,11 +123,12 @@ def begin_sky(m: Model, pixels: Pixels) -> str | None:
     return "what photographs show above the horizon"
 
 
-def sparse_depth_of(folder: Path, s: Scene, seed: int = 0) -> SparseDepthRays | None:
+def sparse_depth_of(folder: Path, s: Scene, seed: int = 0, sweep: Callable[[np.ndarray], SweptPlane | None] = lambda points: None) -> SparseDepthRays | None:
     """Rays to the sparse points that are registered in training images, from the cameras of these and from between each and the nearest of the others that see
     the point, where held-out views may lie and nothing else keeps fog away; None: there are none.
 
     Where the sparse points show what the subject stands on, rays of random pixels to it come with them (`efficientnerf.capture.supports.opaque_support`).
+    Where they do not, `sweep`, which gets those near the scene (N, 3), is asked, and rays to what it finds come with them too.
 
     Only points that are observed in `MIN_TRACK` images or more, and only from cameras that they lie before: posed data sets name points behind a camera,
     or in it, too. Where they are observed more than `MOST_OBSERVATIONS` times, `seed` draws the points.
@@ -157,19 +159,15 @@ def sparse_depth_of(folder: Path, s: Scene, seed: int = 0) -> SparseDepthRays | 
     found = _rays(origins, offset / distance[:, None], distance, on_support=False)
     middle, reach = s.bounds.mean(axis=0), NEAR_THE_SCENE * (s.bounds[1] - s.bounds[0]).max() / 2
     near = (np.abs(xyz - middle) <= reach).all(axis=1)
-    support = opaque_support(xyz[tracked & near], centres[in_training], centres[view], to_point / length[:, None], length)
+    points, known = xyz[tracked & near], (centres[view], to_point / length[:, None], length)
+    support = opaque_support(points, centres[in_training], *known)
+    if support is None and (plane := sweep(points)) is not None:
+        support = unless_seen_through(Support(plane.normal, plane.offset, Delaunay(plane.xyz[:, :2]), np.zeros((0, 2))), size_of(points), *known)
+        if support is not None:
+            offset = np.concatenate([plane.xyz - plane.cameras[:, number] for number in (0, 1)])
+            distance = np.linalg.norm(offset, axis=1)
+            found = _joined(found, _rays(plane.cameras.transpose(1, 0, 2).reshape(-1, 3), offset / distance[:, None], distance, on_support=False))
     return found if support is None else _with_support(found, support, scene.views_of(s, "train"), seed)
-
-
-def with_stereo(found: SparseDepthRays, xyz: np.ndarray, own: np.ndarray, other: np.ndarray) -> SparseDepthRays:
-    """With rays to the points of stereo: from the cameras that show them, and from between these and others that do, as of `stereo.stereo_points`."""
-    share = (GOLDEN * np.arange(1, len(xyz) + 1) % 1)[:, None]
-    origins = np.concatenate([own, own + share * (other - own)])
-    offset = np.concatenate([xyz, xyz]) - origins
-    distance = np.linalg.norm(offset, axis=1)
-    apart = distance > MIN_DISTANCE
-    dense = _rays(origins[apart], offset[apart] / distance[apart, None], distance[apart], on_support=False)
-    return replace(_joined(dense, found), of_stereo=len(dense))
 
 
 def _with_support(found: SparseDepthRays, support: Support, views: tuple[View, ...], seed: int) -> SparseDepthRays:
@@ -188,10 +186,7 @@ def _with_support(found: SparseDepthRays, support: Support, views: tuple[View, .
 
 
 def _joined(first: SparseDepthRays, second: SparseDepthRays) -> SparseDepthRays:
-    origins, directions, distance, on_support = (
-        np.concatenate([getattr(first, name), getattr(second, name)]) for name in ("origins", "directions", "distance", "on_support")
-    )
-    return SparseDepthRays(origins, directions, distance, on_support)
+    return SparseDepthRays(**{name: np.concatenate([values, getattr(second, name)]) for name, values in vars(first).items()})
 
 
 def _rays(origins: np.ndarray, directions: np.ndarray, distance: np.ndarray, *, on_support: bool) -> SparseDepthRays:

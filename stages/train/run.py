@@ -7,14 +7,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from efficientnerf.model import model
+import numpy as np
+
+from efficientnerf.capture.plane_sweep import SweptPlane
+from efficientnerf.model import Model, model
 from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.settings import resolved
 from efficientnerf.training import loop
 from efficientnerf.training.loop import Trainer
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.readback import AsyncOccupancy
-from efficientnerf.training.sparse_depth import STEREO_ENDS, SparseDepthRays
+from efficientnerf.training.sparse_depth import SparseDepthRays
 from pipeline.stage import Job
 from stages.artifacts import TrainOutputs
 from stages.compiling import clock, running_kernels
@@ -25,14 +28,14 @@ from stages.train.budget import UNKNOWN, Budget, training_budget
 from stages.train.checkpoints import Checkpoints
 from stages.train.checks.watch import Watch
 from stages.train.checks.wrong_views import findings_of, train_and_check, write_cameras
-from stages.train.data import begin_sky, count_pixels, depth_range, pixels_of, sparse_depth_of, with_stereo
+from stages.train.data import begin_sky, count_pixels, depth_range, pixels_of, sparse_depth_of
 from stages.train.exposure import begin_exposure, exposure_facts, saved_exposure
 from stages.train.hash_resolution import with_auto_sizes
 from stages.train.log import TrainLog
 from stages.train.memory import rows_for_training
 from stages.train.previews import Previews
 from stages.train.priors import Prior, cells_closed_at_first, mask_uncovered_cells
-from stages.train.stereo import stereo_points
+from stages.train.sweep import find_plane
 
 
 @running_kernels
@@ -74,7 +77,7 @@ def trained(job: Job) -> bool:
         return False
 
     log.begin_step()
-    for done in train_and_check(job, t, pixels, s, lambda scene_now: sparse_depth(job, folder, scene_now, t, pixels, views)):
+    for done in train_and_check(job, t, pixels, s, lambda scene_now: sparse_depth(job, folder, scene_now, m, pixels, views)):
         log.end_step(done)
         if budget is not None:
             follow_budget(job, t, budget)
@@ -98,24 +101,19 @@ def trained(job: Job) -> bool:
     return True
 
 
-def sparse_depth(job: Job, folder: Path, s: Scene, t: Trainer, pixels: Pixels, views: tuple[View, ...]) -> SparseDepthRays | None:
-    """Rays to sparse points, and with `stereo` to those that it finds. A message says where there are points and none can be used."""
-    settings = t.model.settings
-    found = sparse_depth_of(folder, s, settings.seed)
+def sparse_depth(job: Job, folder: Path, s: Scene, m: Model, pixels: Pixels, views: tuple[View, ...]) -> SparseDepthRays | None:
+    """Rays to sparse points. A message says where there are points and none can be used."""
+    settings, searched = m.settings, partial(job.reached, total=1.0, text="searching for the plane of the table or floor")
+
+    def sweep(points: np.ndarray) -> SweptPlane | None:
+        return find_plane(s, pixels, views, points, settings.seed, searched) if settings.sparse_depth_loss_weight > 0 and m.space.unbounded else None
+
+    found = sparse_depth_of(folder, s, settings.seed, sweep)
     if found is None and s.points and settings.sparse_depth_loss_weight > 0:
         job.say("no sparse point is in front of enough of the training cameras that observe it; train.sparse_depth_loss_weight has no effect")
     if found is not None and found.on_support.any():
         job.say(f"the subject stands on a plane, where rays end: {int(found.on_support.sum())} rays to it are trained on")
-    if not settings.stereo or t.schedule.fraction(t.step) >= STEREO_ENDS:
-        return found
-    dense = None
-    if found is not None and settings.sparse_depth_loss_weight > 0 and t.model.space.unbounded:
-        dense = stereo_points(folder, s, pixels, views, settings, lambda share: job.reached(share, 1.0, "comparing photographs"))
-    if found is None or dense is None:
-        job.say("train.stereo has no effect: it is for unbounded scenes with sparse points and a depth loss")
-        return found
-    job.say(f"stereo finds {len(dense[0])} points that two photographs agree on")
-    return with_stereo(found, *dense)
+    return found
 
 
 def begin_budget(job: Job, t: Trainer, spent: float) -> Budget | None:

@@ -33,7 +33,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="train",
-    version=22,
+    version=23,
     settings=TrainSettings,
     needs=("poses",),
     run=ByName("stages.train.run:run"),

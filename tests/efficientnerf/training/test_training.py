@@ -145,7 +145,7 @@ def test_sparse_depth_gathers_the_weight_at_its_points() -> None:
     losses = []
     for step in range(1, 41):
         rng = np.random.default_rng(step)
-        aimed = sent(aimed_rays(rays, 16, 0.0, rng), m.device)
+        aimed = sent(aimed_rays(rays, 16, rng), m.device)
         outputs = render_rays(m, *aimed.bundle, prune=False, rng=rng)
         loss = sparse_depth_loss(outputs, aimed.distance, aimed.on_support, m.settings.samples_per_pivot, None)
         loss.backward()
@@ -186,7 +186,7 @@ def test_rays_to_sparse_points_count_alone_though_others_come_first(complete: bo
     directions = rng.normal(size=(30, 3)).astype(np.float32)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     rays = SparseDepthRays(-3 * directions, directions, rng.uniform(2, 4, 30).astype(np.float32), np.arange(30) % 3 == 0)
-    aimed, others = (sent(aimed_rays(rays, count, 0.0, np.random.default_rng(count)), m.device) for count in (9, 20))
+    aimed, others = (sent(aimed_rays(rays, count, np.random.default_rng(count)), m.device) for count in (9, 20))
     counted = torch.tensor([True] * 20 + [complete, True, complete] * 3)
 
     def found(parts: list[AimedRays]) -> tuple[float, torch.Tensor]:

@@ -1,0 +1,273 @@
+"""The plane that a subject stands on, where a table has too little texture for features: that along which photographs agree (plane sweeping, Collins 1996).
+
+A patch of faint grain says little; thousands of them in pairs of photographs agree on one plane. V photographs, E pairs of them, P patches of S samples.
+"""
+
+from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.optimize import minimize
+
+from efficientnerf.capture.supports import along
+from efficientnerf.geometry.cameras import Camera, project, resized
+
+# docs/experiments/plane-sweep.md
+PIXELS = 320 * 240  # of a picture, at most
+FINE, COARSE = 0.7, 4.0  # deviations in pixels of the Gaussians between which detail lies
+LEAST_DETAIL = 0.6  # deviation of a patch, of 255
+SIDE = 9  # pixels along a patch
+NARROW, WIDE, BEST = 5.0, 35.0, 15.0  # degrees between two cameras of a pair, round the subject
+PAIRS, PATCHES, FITTED, TRIED = 2, 96, 24, 6  # pairs of a photograph; patches of a pair: of all, to fit a plane, and while many are tried
+AROUND = 2.0  # sizes of the subject, within which patches are
+NEAR_POINTS = 0.04  # of a picture's width: how far sparse points are from a patch
+TILTS, TILT = 2, 4.0  # planes that are tried to either side of level, along x and y, and degrees from one to the next
+BELOW, STEP = 0.3, 0.03  # of the subject's size: how far below it planes are tried, and how far apart
+LOWEST = 1.0  # per cent of the sparse points that may be below what is tried
+TRIES = 60  # evaluations of a local search
+AGREE, AGREE_ON_PLANE = 0.6, 0.15  # correlation of a patch that lies on the plane, and least mean of all patches
+APART, LESS = 0.2, 0.6  # of the subject's size: how far above and below the plane patches agree at most so many times as well
+SAME = 0.05  # of the subject's size: how far apart the planes of two halves of the pairs may be
+SHOWN = 0.5  # of the patches, that second photographs should show
+FEWEST = 100  # patches that lie on the plane
+OUTSIDE = -1e6  # pixels: of what a lens does not show
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A photograph without distortion: of a pinhole camera that sees about the same."""
+
+    detail: np.ndarray  # (H, W) float32, what is between two Gaussians
+    clear: np.ndarray  # (H, W) bool, what may show the plane
+    matrix: np.ndarray  # (3, 3) float64, from directions to pixels; the first pixel's centre is at (0, 0)
+    # of the camera: its axes in the world as columns, and where it stands
+    rotation: np.ndarray
+    centre: np.ndarray
+
+
+def picture_of(grey: np.ndarray, usable: np.ndarray, camera: Camera, points: np.ndarray, most: int = PIXELS) -> Picture:
+    """Of a photograph (H, W) uint8 and its pixels that count (H, W) bool, reduced to at most so many pixels; where sparse points (N, 3) are near it is not
+    clear."""
+    scale = min(1.0, (most / grey.size) ** 0.5)
+    width, height = (max(2, round(length * scale)) for length in (camera.width, camera.height))
+    lens = (reduced := resized(camera, width, height)).intrinsics
+    matrix = np.array([[lens["fx"], 0, lens["cx"] - 0.5], [0, lens["fy"], lens["cy"] - 0.5], [0, 0, 1]])
+    rotation, centre = camera.world_from_camera[:3, :3], np.asarray(camera.centre)
+    pixels = np.stack([*np.meshgrid(np.arange(width), np.arange(height)), np.ones((height, width))], axis=-1).reshape(-1, 3)
+    seen = project(reduced, pixels @ np.linalg.inv(matrix).T @ rotation.T + centre)[0] - 0.5
+    across, down = (np.ascontiguousarray(axis.reshape(height, width)) for axis in np.nan_to_num(seen, nan=OUTSIDE).clip(OUTSIDE, -OUTSIDE).astype(np.float32).T)
+
+    def straight(image: np.ndarray) -> np.ndarray:
+        small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        return np.asarray(cv2.remap(small, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0))
+
+    even = straight(grey).astype(np.float32)
+    detail = cv2.GaussianBlur(even, (0, 0), FINE) - cv2.GaussianBlur(even, (0, 0), COARSE)
+    clear = straight(np.where(usable, np.uint8(255), np.uint8(0))) == 255
+    margin = SIDE // 2 + round(2 * COARSE)  # which detail is blurred over
+    clear = cv2.erode(np.pad(clear, 1).astype(np.uint8), np.ones((2 * margin + 1,) * 2, np.uint8))[1:-1, 1:-1] > 0
+    near = np.zeros((height, width), np.uint8)
+    at = (points - centre) @ rotation
+    at = at[at[:, 2] > 0] @ matrix.T
+    x, y = np.rint(at[:, :2] / at[:, 2:]).T
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    near[y[inside].astype(int), x[inside].astype(int)] = 1
+    radius = max(SIDE // 2, round(NEAR_POINTS * width))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)
+    near = cv2.morphologyEx(cv2.dilate(near, disc), cv2.MORPH_CLOSE, disc)
+    return Picture(detail, clear & (near == 0), matrix, rotation, centre)
+
+
+@dataclass(frozen=True, eq=False)
+class SweptPlane:
+    """A plane, and the patches that two photographs agree on along it."""
+
+    normal: np.ndarray  # (3,) upwards
+    offset: float
+    xyz: np.ndarray  # (P, 3)
+    cameras: np.ndarray  # (P, 2, 3) where those that show each stand
+
+
+def swept_plane(pictures: Sequence[Picture], points: np.ndarray, seed: int, tick: Callable[[float], None] = lambda share: None) -> SweptPlane | None:
+    """The nearly level plane, z up, below a subject of which sparse points (N, 3) are known; None where photographs agree along none.
+
+    Two halves of the pairs find it, each by itself, and it is below most points and cameras. What `tick`, which gets the share that is done, raises stops the
+    search.
+    """
+    centres = np.array([picture.centre for picture in pictures]).reshape(-1, 3)
+    if len(points) < 3 or len(pictures) < 3:
+        return None
+    middle = np.median(points, axis=0)
+    near = points[np.linalg.norm(points - middle, axis=1) <= np.median(np.linalg.norm(centres - middle, axis=1))]
+    if len(near) < 3:
+        return None
+    size, lowest = 2 * float(np.median(np.linalg.norm(near - middle, axis=1))), float(np.percentile(near[:, 2], LOWEST))
+    pairs = _pairs(centres - middle)
+    rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 10, 0]))
+    stack = _Stack(pictures)
+    halves = [_Patches(stack, pairs[begin::2], middle, lowest, size, rng) for begin in (0, 1)]
+    if min(len(half.pair) for half in halves) < FEWEST:
+        return None
+    found = _tried([half.fewer(TRIED, 2) for half in halves], np.arange(lowest - BELOW * size, middle[2], STEP * size), tick)
+    if found is None:
+        return None
+    (first, own), (second, other) = (half.fewer(FITTED).fitted(found) for half in halves)
+    apart = np.abs(first - second)
+    if min(own, other) < AGREE_ON_PLANE or apart[2] + size * np.hypot(apart[0], apart[1]) > SAME * size:
+        return None
+    plane = (first + second) / 2
+    away = np.array([0, 0, APART * size])
+    if any(half.agreement(other) > LESS * half.agreement(plane) for half in halves for other in (plane - away, plane + away)):
+        return None
+    normal, offset = _plane(plane, middle)
+    if np.median(along(near, normal)) < offset or (along(centres, normal) > offset).mean() < 0.8:
+        return None
+    on = [half.on(plane) for half in halves]
+    xyz, shown = np.concatenate([at for at, _ in on]), np.concatenate([numbers for _, numbers in on])
+    return SweptPlane(normal, offset, xyz, centres[shown]) if len(xyz) >= FEWEST else None
+
+
+def _pairs(towards: np.ndarray) -> np.ndarray:
+    """(E, 2) of photographs that see the subject from a few degrees apart, by where they stand from it (V, 3)."""
+    away = towards / np.linalg.norm(towards, axis=1, keepdims=True).clip(min=1e-12)
+    degrees = np.degrees(np.arccos(np.clip((away[:, None] * away).sum(-1), -1, 1)))
+    cost = np.where((degrees >= NARROW) & (degrees <= WIDE), np.abs(degrees - BEST), np.inf)
+    order = np.argsort(cost, axis=1, kind="stable")[:, :PAIRS]
+    first, rank = np.nonzero(np.isfinite(np.take_along_axis(cost, order, axis=1)))
+    return np.stack([first, order[first, rank]], axis=1)
+
+
+def _plane(tilted: np.ndarray, middle: np.ndarray) -> tuple[np.ndarray, float]:
+    """Normal and offset of a plane as slopes along x and y, and its height at the middle."""
+    normal = np.array([tilted[0], tilted[1], 1.0]) / np.sqrt(1 + tilted[0] ** 2 + tilted[1] ** 2)
+    return normal, float(normal @ [middle[0], middle[1], tilted[2]])
+
+
+class _Stack:
+    """All pictures end to end."""
+
+    def __init__(self, pictures: Sequence[Picture]) -> None:
+        self.pictures, self.centres = pictures, np.array([picture.centre for picture in pictures])
+        shapes = np.array([picture.detail.shape for picture in pictures])
+        self.width, self.height = shapes[:, 1], shapes[:, 0]
+        self.begin = np.concatenate([[0], np.cumsum(self.width * self.height)])
+        self.detail = np.concatenate([picture.detail.ravel() for picture in pictures])
+        self.clear = np.concatenate([picture.clear.ravel() for picture in pictures])
+
+
+class _Patches:
+    """Patches of the first photographs of pairs, to be found in the second ones."""
+
+    def __init__(self, stack: _Stack, pairs: np.ndarray, middle: np.ndarray, lowest: float, size: float, rng: np.random.Generator) -> None:
+        self.stack, self.pairs, self.middle, self.size = stack, pairs, middle, size
+        chosen = [self._chosen(stack.pictures[first], lowest, rng) for first, _ in pairs]
+        self.pair = np.repeat(np.arange(len(pairs)), [len(each) for each in chosen])
+        self.at = np.concatenate(chosen) if chosen else np.zeros((0, 2), int)  # (P, 2) x, y
+        side = np.arange(SIDE) - SIDE // 2
+        self.window = np.stack([*np.meshgrid(side, side), np.zeros((SIDE, SIDE))], axis=-1).reshape(-1, 3)
+        x, y = (self.at[:, None] + self.window[:, :2].astype(int)).transpose(2, 0, 1)
+        own = pairs[self.pair, 0][:, None]
+        self.own = _normalised(stack.detail[stack.begin[own] + y * stack.width[own] + x])
+
+    def _chosen(self, picture: Picture, lowest: float, rng: np.random.Generator) -> np.ndarray:
+        """(P, 2) pixels with detail that see the surroundings of the subject, at the height of its lowest points."""
+        x, y, towards = _rays(picture)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = (lowest - picture.centre[2]) / towards[:, 2]
+            at = picture.centre + distance[:, None] * towards
+        with np.errstate(invalid="ignore", over="ignore"):
+            around = (distance > 0) & (np.hypot(*(at[:, :2] - self.middle[:2]).T) <= AROUND * self.size)
+        square = cv2.boxFilter(picture.detail**2, -1, (SIDE, SIDE)) - cv2.boxFilter(picture.detail, -1, (SIDE, SIDE)) ** 2
+        pixels = np.flatnonzero(around & (picture.clear & (square > LEAST_DETAIL**2)).ravel())
+        pixels = rng.choice(pixels, min(len(pixels), PATCHES), replace=False)
+        return np.stack([x[pixels], y[pixels]], axis=1)
+
+    def fewer(self, each: int, apart: int = 1) -> "_Patches":
+        """Some patches of each pair, with samples so many pixels apart."""
+        part = copy(self)
+        keep = np.arange(len(self.pair)) - np.searchsorted(self.pair, self.pair) < each
+        sparse = (self.window[:, :2] % apart == 0).all(axis=1)
+        part.pair, part.at, part.window, part.own = self.pair[keep], self.at[keep], self.window[sparse], _normalised(self.own[keep][:, sparse])
+        return part
+
+    def correlations(self, tilted: np.ndarray) -> np.ndarray:
+        """(P,) of each patch with what the second photograph shows of it if it lies on a plane; NaN where that is not clear."""
+        (normal, offset), stack = _plane(tilted, self.middle), self.stack
+        to = np.array([_homography(stack.pictures[first], stack.pictures[second], normal, offset) for first, second in self.pairs])
+        pixels = np.concatenate([self.at, np.ones((len(self.at), 1))], axis=1)[:, None] + self.window
+        other = np.einsum("pij,psj->psi", to[self.pair], pixels)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x, y = other[..., 0] / other[..., 2], other[..., 1] / other[..., 2]
+        number = self.pairs[self.pair, 1][:, None]
+        inside = ((other[..., 2] > 0) & (x >= 0) & (x < stack.width[number] - 1) & (y >= 0) & (y < stack.height[number] - 1)).all(axis=1)
+        x, y, number = x[inside], y[inside], number[inside]
+        left, top = x.astype(int), y.astype(int)
+        at = stack.begin[number] + top * stack.width[number] + left
+        right, down = (x - left).astype(np.float32), (y - top).astype(np.float32)
+        upper = stack.detail[at] * (1 - right) + stack.detail[at + 1] * right
+        below = at + stack.width[number]
+        theirs = upper * (1 - down) + (stack.detail[below] * (1 - right) + stack.detail[below + 1] * right) * down
+        usable = stack.clear[at[:, len(self.window) // 2]] & (theirs.std(axis=1) > LEAST_DETAIL)
+        found = np.full(len(self.at), np.nan, np.float32)
+        found[np.flatnonzero(inside)[usable]] = (self.own[inside][usable] * _normalised(theirs[usable])).sum(axis=1)
+        return found
+
+    def agreement(self, tilted: np.ndarray) -> float:
+        """The mean correlation; less where few of the patches are shown."""
+        found = self.correlations(tilted)
+        return float(np.nansum(found) / max(np.isfinite(found).sum(), SHOWN * len(found)))
+
+    def fitted(self, tilted: np.ndarray) -> tuple[np.ndarray, float]:
+        """The plane near another along which patches agree most, and how well."""
+        scale = np.array([np.radians(TILT), np.radians(TILT), STEP * self.size])
+        simplex = tilted / scale + np.concatenate([np.zeros((1, 3)), 0.5 * np.eye(3)])
+        found = minimize(
+            lambda at: -self.agreement(at * scale), simplex[0], method="Nelder-Mead", options={"initial_simplex": simplex, "maxfev": TRIES}
+        )  # fmt: skip
+        return found.x * scale, -float(found.fun)
+
+    def on(self, tilted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where patches that lie on a plane are (P, 3), and the two pictures of each (P, 2)."""
+        normal, offset = _plane(tilted, self.middle)
+        kept = np.flatnonzero(np.nan_to_num(self.correlations(tilted)) >= AGREE)
+        xyz = np.empty((len(kept), 3))
+        for row, patch in enumerate(kept):
+            picture = self.stack.pictures[self.pairs[self.pair[patch], 0]]
+            towards = picture.rotation @ np.linalg.solve(picture.matrix, [*self.at[patch], 1])
+            xyz[row] = picture.centre + (offset - normal @ picture.centre) / (normal @ towards) * towards
+        return xyz, self.pairs[self.pair[kept]]
+
+def _tried(halves: Sequence[_Patches], heights: np.ndarray, tick: Callable[[float], None]) -> np.ndarray | None:
+    """The plane of a grid of tilts and heights along which patches agree most."""
+    slopes = np.tan(np.radians(TILT * np.arange(-TILTS, TILTS + 1)))
+    best, found = 0.0, None
+    for done, (across, down) in enumerate((across, down) for across in slopes for down in slopes):
+        tick(done / len(slopes) ** 2)
+        for height in heights:
+            tilted = np.array([across, down, height])
+            agreement = sum(half.agreement(tilted) for half in halves)
+            if agreement > best:
+                best, found = agreement, tilted
+    return found
+
+
+def _homography(own: Picture, other: Picture, normal: np.ndarray, offset: float) -> np.ndarray:
+    """(3, 3) from pixels (x, y, 1) of a picture to another's, of points on a plane."""
+    turn, shift = other.rotation.T @ own.rotation, other.rotation.T @ (own.centre - other.centre)
+    height = offset - normal @ own.centre
+    return np.asarray(other.matrix @ (turn + np.outer(shift, own.rotation.T @ normal) / (height or 1e-12)) @ np.linalg.inv(own.matrix))
+
+
+def _rays(picture: Picture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """x, y (H W,) of all pixels, and the directions (H W, 3) that they see."""
+    y, x = (axis.ravel() for axis in np.indices(picture.detail.shape))
+    towards = np.stack([x, y, np.ones_like(x)], axis=1) @ np.linalg.inv(picture.matrix).T @ picture.rotation.T
+    return x, y, towards
+
+
+def _normalised(values: np.ndarray) -> np.ndarray:
+    """Patches (P, S) of mean 0 and length 1."""
+    values = values - values.mean(axis=1, keepdims=True)
+    return np.asarray(values / np.linalg.norm(values, axis=1, keepdims=True).clip(min=1e-6), np.float32)
