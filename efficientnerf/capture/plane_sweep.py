@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from scipy.optimize import minimize
+from scipy.spatial import cKDTree
 
 from efficientnerf.capture.supports import along
 from efficientnerf.geometry.cameras import Camera, project, resized
@@ -29,6 +30,7 @@ LOWEST = 1.0  # per cent of the sparse points that may be below what is tried
 TRIES = 60  # evaluations of a local search
 AGREE, AGREE_ON_PLANE = 0.6, 0.15  # correlation of a patch that lies on the plane, and least mean of all patches
 APART, LESS = 0.2, 0.6  # of the subject's size: how far above and below the plane patches agree at most so many times as well
+NEIGHBOURS, AGREE_AROUND = 12, 0.8  # patches round one that lies on the plane, and how well they agree at least, over the upper quartile of all
 SAME = 0.05  # of the subject's size: how far apart the planes of two halves of the pairs may be
 SHOWN = 0.5  # of the patches, that second photographs should show
 FEWEST = 100  # patches that lie on the plane
@@ -231,13 +233,18 @@ class _Patches:
     def on(self, tilted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where patches that lie on a plane are (P, 3), and the two pictures of each (P, 2)."""
         normal, offset = _plane(tilted, self.middle)
-        kept = np.flatnonzero(np.nan_to_num(self.correlations(tilted)) >= AGREE)
-        xyz = np.empty((len(kept), 3))
-        for row, patch in enumerate(kept):
-            picture = self.stack.pictures[self.pairs[self.pair[patch], 0]]
+        correlations = self.correlations(tilted)
+        seen = np.flatnonzero(np.isfinite(correlations))
+        xyz, correlation, pairs = np.empty((len(seen), 3)), correlations[seen], self.pairs[self.pair[seen]]
+        for row, patch in enumerate(seen):
+            picture = self.stack.pictures[pairs[row, 0]]
             towards = picture.rotation @ np.linalg.solve(picture.matrix, [*self.at[patch], 1])
             xyz[row] = picture.centre + (offset - normal @ picture.centre) / (normal @ towards) * towards
-        return xyz, self.pairs[self.pair[kept]]
+        if len(xyz) < NEIGHBOURS:
+            return xyz[:0], pairs[:0]
+        around = correlation[cKDTree(xyz).query(xyz, k=NEIGHBOURS)[1]].mean(axis=1)
+        kept = (correlation >= AGREE) & (around >= AGREE_AROUND * np.percentile(around, 75))
+        return xyz[kept], pairs[kept]
 
 def _tried(halves: Sequence[_Patches], heights: np.ndarray, tick: Callable[[float], None]) -> np.ndarray | None:
     """The plane of a grid of tilts and heights along which patches agree most."""

@@ -31,6 +31,7 @@ MAX_POINTS = 4000  # that a level plane is looked for in
 # Of a support that rays do not pass: points on it at least; sine from which rays meet it; of the rays to sparse points that meet it, those that go on, and by
 # how much of the distance; of the extent of the points, round such a ray. docs/experiments/losses.md
 MIN_ON_SUPPORT, GRAZING, MAX_SEEN_THROUGH, SLACK, HOLE = 30, 0.1, 0.05, 0.03, 0.05
+GAP, UNDER = 0.3, 0.75  # of the subject's size: a wide gap between patches; how far from its middle they may be hidden by it
 MAX_FOOT_HEIGHT = 0.3  # of the subject's size, that a part of it stands above a support at most
 
 Plane = tuple[np.ndarray, float]
@@ -145,6 +146,7 @@ class Support:
     outline: Delaunay  # of the points on it, x and y
     holes: np.ndarray  # (H, 2) x, y of points below that are seen through it, and of where
     around: float = 0.0  # distance from these at which it is not known to be opaque
+    solid: np.ndarray | None = None  # (T,) bool, triangles of the outline that are part of it; None: all
 
     def distances(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """(R,) along rays (R, 3), to where they meet it from above; infinite where they do not."""
@@ -153,7 +155,8 @@ class Support:
             distance = (along(origins, self.normal) - self.offset) / toward
         meets = np.flatnonzero((toward > GRAZING) & (distance > 0))
         at = origins[meets, :2] + distance[meets, None] * directions[meets, :2]
-        inside = self.outline.find_simplex(at) >= 0
+        triangle = self.outline.find_simplex(at)
+        inside = triangle >= 0 if self.solid is None else (triangle >= 0) & self.solid[triangle]
         if len(self.holes) and inside.any():
             inside[inside] = cKDTree(self.holes).query(at[inside])[0] > self.around
         out = np.full(len(origins), np.inf)
@@ -166,7 +169,7 @@ def opaque_support(points: np.ndarray, cameras: np.ndarray, origins: np.ndarray,
     points at `lengths` (R,) go on through it."""
     if len(points) < MIN_ON_SUPPORT:
         return None
-    size = size_of(points)
+    size = _size(points)
     broadest: tuple[float, Support] | None = None
     for _ in range(MAX_SUPPORTS + 1):
         if (plane := level_plane(points, cameras, np.array([0.0, 0.0, 1.0]))) is None:
@@ -178,24 +181,45 @@ def opaque_support(points: np.ndarray, cameras: np.ndarray, origins: np.ndarray,
         area = float(ConvexHull(on[:, :2]).volume)
         if broadest is None or area > broadest[0]:
             broadest = area, Support(*plane, Delaunay(on[:, :2]), np.zeros((0, 2)))
-    return None if broadest is None else unless_seen_through(broadest[1], size, origins, directions, lengths)
+    return None if broadest is None else _unless_seen_through(broadest[1], size, origins, directions, lengths)
 
 
-def unless_seen_through(support: Support, size: float, origins: np.ndarray, directions: np.ndarray, lengths: np.ndarray) -> Support | None:
-    """A support with holes where some rays (R, 3) to sparse points at `lengths` (R,) go on through it; None where many do.
+def support_of_patches(
+    plane: Plane, patches: np.ndarray, points: np.ndarray, origins: np.ndarray, directions: np.ndarray, lengths: np.ndarray
+) -> Support | None:
+    """A level plane as far as patches on it (N, 3) reach, under a subject of sparse points (M, 3); None where rays (R, 3) to such points at `lengths` (R,) go
+    on through it.
 
-    size  of the subject
+    A wide gap between patches is part of it near the subject alone, and where no such ray goes on through it: a table has an edge.
     """
+    size, whole = _size(points), Support(*plane, Delaunay(patches[:, :2]), np.zeros((0, 2)))
+    corners = whole.outline.points[whole.outline.simplices]
+    wide = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1) > GAP * size
+    solid = ~wide | (np.linalg.norm(corners.mean(axis=1) - np.median(points[:, :2], axis=0), axis=1) <= UNDER * size)
+    distance = whole.distances(origins, directions)
+    goes_on = _that_go_on(distance, lengths, size)
+    crossed = whole.outline.find_simplex(origins[goes_on, :2] + distance[goes_on, None] * directions[goes_on, :2])
+    solid[crossed] &= ~wide[crossed]
+    return _unless_seen_through(replace(whole, solid=solid), size, origins, directions, lengths)
+
+
+def _that_go_on(distance: np.ndarray, lengths: np.ndarray, size: float) -> np.ndarray:
+    """Of rays that meet a support at distances (R,), infinite where they do not, the numbers of those that end behind it."""
+    meets = np.flatnonzero(np.isfinite(distance))
+    return np.asarray(meets[lengths[meets] > distance[meets] * (1 + SLACK) + FLAT * size])
+
+
+def _unless_seen_through(support: Support, size: float, origins: np.ndarray, directions: np.ndarray, lengths: np.ndarray) -> Support | None:
+    """A support with holes where some rays (R, 3) to sparse points at `lengths` (R,) go on through it; None where many do."""
     distance = support.distances(origins, directions)
-    meets = np.isfinite(distance)
-    goes_on = np.flatnonzero(meets)[lengths[meets] > distance[meets] * (1 + SLACK) + FLAT * size]
-    if len(goes_on) > MAX_SEEN_THROUGH * meets.sum():
+    goes_on = _that_go_on(distance, lengths, size)
+    if len(goes_on) > MAX_SEEN_THROUGH * np.isfinite(distance).sum():
         return None
     ways = [origins[goes_on, :2] + to[goes_on, None] * directions[goes_on, :2] for to in (distance, lengths)]
     return replace(support, holes=np.concatenate(ways), around=HOLE * size)
 
 
-def size_of(points: np.ndarray) -> float:
+def _size(points: np.ndarray) -> float:
     """About how large a subject of sparse points (N, 3) is."""
     return 2 * float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
 

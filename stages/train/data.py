@@ -5,10 +5,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import Delaunay
 
 from efficientnerf.capture.plane_sweep import SweptPlane
-from efficientnerf.capture.supports import Support, opaque_support, size_of, unless_seen_through
+from efficientnerf.capture.supports import Support, opaque_support, support_of_patches
 from efficientnerf.geometry.cameras import rays
 from efficientnerf.model import Model
 from efficientnerf.training.pixels import PixelRows, Pixels
@@ -162,7 +161,7 @@ def sparse_depth_of(folder: Path, s: Scene, seed: int = 0, sweep: Callable[[np.n
     points, known = xyz[tracked & near], (centres[view], to_point / length[:, None], length)
     support = opaque_support(points, centres[in_training], *known)
     if support is None and (plane := sweep(points)) is not None:
-        support = unless_seen_through(Support(plane.normal, plane.offset, Delaunay(plane.xyz[:, :2]), np.zeros((0, 2))), size_of(points), *known)
+        support = support_of_patches((plane.normal, plane.offset), plane.xyz, points, *known)
         if support is not None:
             offset = np.concatenate([plane.xyz - plane.cameras[:, number] for number in (0, 1)])
             distance = np.linalg.norm(offset, axis=1)

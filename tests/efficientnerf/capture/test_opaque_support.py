@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from efficientnerf.capture.supports import Support, opaque_support
+from efficientnerf.capture.supports import Support, opaque_support, support_of_patches
 
 CAMERAS = np.array([[3 * np.cos(a), 3 * np.sin(a), 1.5] for a in np.arange(0, 2 * np.pi, 0.4)])
 HEIGHT = -0.2
@@ -54,3 +54,38 @@ def test_a_pit_of_which_few_points_are_seen_stays_open(table: np.ndarray) -> Non
     into, away = support.distances(np.array([[0.52, 0.52, 1], [-0.5, -0.5, 1]]), down)
     assert np.isinf(into)
     assert away == pytest.approx(1 - HEIGHT, abs=0.01)
+
+
+def of_patches(patches: np.ndarray, others: np.ndarray) -> Support | None:
+    """Of patches on the table under a subject; by rays from each camera to the subject and to other points."""
+    subject = np.random.default_rng(3).uniform((-0.2, -0.2, HEIGHT), (0.2, 0.2, 0.3), (300, 3))
+    points = np.concatenate([subject, others])
+    offset = points[None] - CAMERAS[:, None]
+    length = np.linalg.norm(offset, axis=-1)
+    rays = np.broadcast_to(CAMERAS[:, None], offset.shape).reshape(-1, 3), (offset / length[..., None]).reshape(-1, 3), length.reshape(-1)
+    return support_of_patches((np.array([0.0, 0, 1]), HEIGHT), patches, subject, *rays)
+
+
+def test_patches_round_a_subject_are_a_table_with_an_edge() -> None:
+    """Two boards of a table, with a wide gap between them that nothing is seen through: only what is under the subject is part of the table."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-2, 2, 81), np.linspace(-0.6, 0.6, 25)))
+    boards = np.column_stack([x, y, np.full(len(x), HEIGHT)])[(np.hypot(x, y) > 0.25) & ((np.abs(x) < 0.6) | (np.abs(x) > 1.4))]
+    support = of_patches(boards, np.zeros((0, 3)))
+    assert support is not None
+    down = np.tile([[0.0, 0, -1]], (4, 1))
+    under, board, gap, past = support.distances(np.array([[0.0, 0, 2], [0.5, 0.5, 2], [1, 0, 2], [1.7, 0.8, 2]]), down)
+    assert under == board == pytest.approx(2 - HEIGHT)
+    assert np.isinf([gap, past]).all()
+
+
+def test_patches_that_rays_go_on_through_are_no_table() -> None:
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-1, 1, 41), np.linspace(-1, 1, 41)))
+    patches = np.column_stack([x, y, np.full(len(x), HEIGHT)])
+    below = np.column_stack([np.random.default_rng(4).uniform(-0.6, 0.6, (60, 2)), np.full(60, HEIGHT - 0.5)])
+    assert of_patches(patches, np.zeros((0, 3))) is not None
+    assert of_patches(patches, below) is None
+    ring = patches[(np.hypot(x, y) > 0.35)]
+    hole = np.column_stack([np.random.default_rng(5).uniform(-0.05, 0.05, (60, 2)), np.full(60, HEIGHT - 0.1)])
+    support = of_patches(ring, hole)
+    assert support is not None, "what is seen through the gap of a ring is no part of it"
+    assert np.isinf(support.distances(np.array([[0.0, 0, 2]]), np.array([[0.0, 0, -1]]))[0])
