@@ -106,6 +106,8 @@ def swept_plane(pictures: Sequence[Picture], points: np.ndarray, seed: int, tick
     if len(near) < 3:
         return None
     size, lowest = 2 * float(np.median(np.linalg.norm(near - middle, axis=1))), float(np.percentile(near[:, 2], LOWEST))
+    if not size > 0:
+        return None
     pairs = _pairs(centres - middle)
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 10, 0]))
     stack = _Stack(pictures)

@@ -192,7 +192,10 @@ def support_of_patches(
 
     A wide gap between patches is part of it near the subject alone, and where no such ray goes on through it: a table has an edge.
     """
-    size, whole = _size(points), Support(*plane, Delaunay(patches[:, :2]), np.zeros((0, 2)))
+    try:
+        size, whole = _size(points), Support(*plane, Delaunay(patches[:, :2]), np.zeros((0, 2)))
+    except QhullError:  # they lie on a line
+        return None
     corners = whole.outline.points[whole.outline.simplices]
     wide = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1) > GAP * size
     solid = ~wide | (np.linalg.norm(corners.mean(axis=1) - np.median(points[:, :2], axis=0), axis=1) <= UNDER * size)

@@ -84,7 +84,8 @@ def test_patches_that_rays_go_on_through_are_no_table() -> None:
     below = np.column_stack([np.random.default_rng(4).uniform(-0.6, 0.6, (60, 2)), np.full(60, HEIGHT - 0.5)])
     assert of_patches(patches, np.zeros((0, 3))) is not None
     assert of_patches(patches, below) is None
-    ring = patches[(np.hypot(x, y) > 0.35)]
+    assert of_patches(patches[:41], np.zeros((0, 3))) is None, "on a line"
+    ring = patches[np.hypot(x, y) > 0.35]
     hole = np.column_stack([np.random.default_rng(5).uniform(-0.05, 0.05, (60, 2)), np.full(60, HEIGHT - 0.1)])
     support = of_patches(ring, hole)
     assert support is not None, "what is seen through the gap of a ring is no part of it"
