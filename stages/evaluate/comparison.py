@@ -33,7 +33,7 @@ from stages.evaluate.lpips_weights import find_weights
 from stages.evaluate.mesh import EvaluatedMesh, mesh_image, mesh_metrics
 from stages.evaluate.sparse_points import ReliablePoints, counts_of, judged
 from stages.evaluate.splats import EvaluatedSplats
-from stages.evaluate.trivial import blurred_psnrs, mean_colour_psnr
+from stages.evaluate.trivial import blurred_psnrs, detail, mean_colour_psnr
 from stages.evaluate.views import GroundTruth, constant_background, ground_truth, subsample, subsample_camera, upsample
 from stages.figures.plots import error_map, to_uint8
 from stages.io.scene import Scene, View
@@ -104,7 +104,7 @@ def evaluate_view(e: Evaluation, view: View, field: FieldRenderer | None, stride
         metrics["sparse_points"] = counts_of(kinds, subject)
     size = {"width": view.camera.width, "height": view.camera.height}
     inside = truth.inside if seen is None or asset.inner is None else upsample(seen.inside_opacity, stride, **size) >= 0.5
-    metrics["asset"] = {**compare(image, truth, inside), **size, **lpips_metrics(e.perceptual, image, truth)}
+    metrics["asset"] = {**compare(image, truth, inside), **size, **lpips_metrics(e.perceptual, image, truth), "psnr_detail": detail_psnr(image, truth)}
     drawn, plain, covered, depth = mesh_image(e.mesh, view.camera, e.background)
     metrics["mesh"] = mesh_metrics(e.shown(view, drawn, "the mesh"), e.shown(view, plain, "the mesh"), covered, depth, image, truth, view.camera)
     if e.splats is not None:
@@ -151,10 +151,19 @@ def differences(
 
 
 def trivial(truth: GroundTruth) -> dict[str, Any] | None:
-    """The scores of pictures of its mean colour and of its blurs; None where no pixel counts."""
+    """The scores of pictures of its mean colour and of its blurs, and those of blurs of its detail; None where no pixel counts."""
     if not truth.used.any():
         return None
-    return {"mean_colour": mean_colour_psnr(truth.colour, truth.mask), "blurred": blurred_psnrs(truth.colour, truth.mask)}
+    blurred, of_detail = (blurred_psnrs(picture, truth.mask) for picture in (truth.colour, detail(truth.colour, truth.mask)))
+    return {"mean_colour": mean_colour_psnr(truth.colour, truth.mask), "blurred": blurred, "blurred_detail": of_detail}
+
+
+def detail_psnr(image: np.ndarray, truth: GroundTruth) -> float | None:
+    """PSNR of a render's detail against the photograph's, colours fitted; None where no pixel counts."""
+    if not truth.used.any():
+        return None
+    fitted = colour_fitted(image, truth.colour, truth.mask)
+    return replace(truth, colour=detail(truth.colour, truth.mask)).psnr(detail(fitted, truth.mask))
 
 
 def counting(truth: GroundTruth) -> np.ndarray:

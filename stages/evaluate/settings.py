@@ -50,7 +50,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="evaluate",
-    version=14,
+    version=15,
     settings=EvaluateSettings,
     needs=("mesh", "splats", "bake", "train", "poses"),
     run=ByName("stages.evaluate.run:run"),

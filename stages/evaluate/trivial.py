@@ -13,6 +13,7 @@ import numpy as np
 
 BLURS = (0.0025, 0.005, 0.01, 0.02, 0.04, 0.08)  # standard deviations of the Gaussian, of the longest side: each twice the one before
 INVISIBLE = 40.0  # dB: an error of 2.5 of 255 levels; two pictures that differ by less are the same, however plain they are
+SHADING = 0.04  # standard deviation of the Gaussian, of the longest side, whose means are shading; what differs from them is detail
 REDUCED = 4.0  # px of standard deviation from which the photograph is reduced first: the same blur to a hundredth of a level, in a fraction of the time
 
 
@@ -27,13 +28,22 @@ def mean_colour_psnr(truth: np.ndarray, mask: np.ndarray | None) -> float:
 
 
 def blurred_psnrs(truth: np.ndarray, mask: np.ndarray | None) -> list[float]:
-    """PSNR of the photograph blurred by each of BLURS, falling: decibels, at most INVISIBLE. What does not count takes no part in it. Arguments as above."""
+    """PSNR of the photograph, or its detail, blurred by each of BLURS, falling: decibels, at most INVISIBLE. What does not count takes no part in it.
+    Arguments as above."""
     found: list[float] = []
     for blur in BLURS:
         picture = blurred(truth, blur * max(truth.shape[:2]), mask)
         errors = np.square(picture.astype(np.float64) - truth).mean(-1)
         found.append(min([_decibels(float((errors if mask is None else errors[mask]).mean())), *found]))
     return found
+
+
+def detail(picture: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """(H, W, 3) float32: a picture less its shading, that of the pixels that count alone. Arguments as above.
+
+    Light, shadows and exposure change the shading of a plain table from photograph to photograph, and a blur does not.
+    """
+    return picture.astype(np.float32) - blurred(picture, SHADING * max(picture.shape[:2]), mask)
 
 
 def blurred(picture: np.ndarray, deviation: float, mask: np.ndarray | None = None) -> np.ndarray:

@@ -10,7 +10,7 @@ give a better grade. Each threshold and its reason: docs/experiments/verdict.md.
 """
 
 import statistics
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -21,6 +21,7 @@ from stages.formats.importers.source import abbreviated
 from stages.reports import CameraVerdict
 from stages.verdict.grades import GRADES
 
+DETAILED = 30.0  # dB: a blurred photograph's detail has less where there is detail to be compared
 USABLE_BLUR, POOR_BLUR, FAILED_BLUR = 0.0125, 0.0225, 0.04  # of the longest side: the blur that costs as much, beyond which a result is no better
 FAILED_GAIN = 3.0  # dB over one colour, below which less than half of what a photograph shows is there
 COLOURS_OFF = 2.0  # dB that fitted colours gain, from which exposure or white balance differ
@@ -113,6 +114,7 @@ def _figures(metrics: Mapping[str, Any], cameras: CameraVerdict | None) -> dict[
     """The figures that grades follow from. PSNR has fitted colours: the unknown exposure of a held-out photograph is no fault of the asset's.
 
     blur ..._blur  `equivalent_blur`: medians over the views; of mesh and Gaussians with as many decibels more as fitting its colours gives the asset
+    detail_blur    that of what differs from shading; None where most photographs have none
     gain           PSNR with fitted colours over that of pictures of one colour, means over the views
     """
     views = _measured(metrics)
@@ -128,6 +130,7 @@ def _figures(metrics: Mapping[str, Any], cameras: CameraVerdict | None) -> dict[
         "mean_colour": statistics.fmean(flat) if views else None,
         "gain": statistics.fmean(fitted) - statistics.fmean(flat) if views else None,
         "blur": _median(view_blur(view) for view in views),
+        "detail_blur": _detail_blur(views),
         "network_blur": _median(equivalent_blur(view["network"]["psnr_colour_fitted"], view["trivial"]["blurred"]) for view in drawn),
         "mesh_blur": _median(_other_blur(view, "mesh") for view in views),
         "splats_blur": None if metrics["splats"] is None else _median(_other_blur(view, "splats") for view in views),
@@ -145,6 +148,12 @@ def _measured(metrics: Mapping[str, Any]) -> list[Any]:
 def view_blur(view: Mapping[str, Any]) -> float:
     """`equivalent_blur` of the asset in a view, as metrics.json has it."""
     return equivalent_blur(view["asset"]["psnr_colour_fitted"], view["trivial"]["blurred"])
+
+
+def _detail_blur(views: Sequence[Mapping[str, Any]]) -> float | None:
+    detailed = [view for view in views if view["trivial"]["blurred_detail"][-1] < DETAILED]
+    blurs = (equivalent_blur(view["asset"]["psnr_detail"], view["trivial"]["blurred_detail"]) for view in detailed)
+    return _median(blurs) if 2 * len(detailed) > len(views) else None
 
 
 def _other_blur(view: Mapping[str, Any], what: str) -> float:
@@ -176,6 +185,8 @@ def _of_held_out(metrics: Mapping[str, Any], figures: Mapping[str, Any], cameras
         return [ResultProblem("not measured", "usable", sentence, "The masks cover what the photographs show.", "Look at the masks (poses.masks).", SHEET)]
     found = []
     grade = grade_of(blur, gain)
+    shaded = grade == "poor" and figures["detail_blur"] is not None and figures["detail_blur"] <= USABLE_BLUR
+    grade = "usable" if shaded else grade
     if metrics["split"] == "train":
         sentence = "All views were trained on: how others would look was not measured."
         found.append(ResultProblem("nothing held out", "usable", sentence, "No photograph was held out.", "Hold some out (poses.test_every).", strip))
@@ -187,7 +198,12 @@ def _of_held_out(metrics: Mapping[str, Any], figures: Mapping[str, Any], cameras
             sentence = f"The asset's renders differ {'strongly ' if grade == 'poor' else ''}from the photographs: {figures['psnr']:.1f} dB on"
             sentence += f" {figures['views']}, as much as a blur of {100 * blur:.2f} % of their longest side would; captures that went well have"
             sentence += f" {100 * USABLE_BLUR:.2f} % at most."
-        found.append(ResultProblem("pictures", grade, sentence, *_cause(metrics, figures, cameras, strip)))
+        cause = _cause(metrics, figures, cameras, strip)
+        if shaded:
+            sentence += f" Their detail is right: it differs as much as after a blur of {100 * figures['detail_blur']:.2f} %."
+            remedy = "Lock the exposure, light the scene evenly, and keep your shadow off it."
+            cause = "The shading of plain surfaces differs from photograph to photograph.", remedy, strip
+        found.append(ResultProblem("pictures", grade, sentence, *cause))
     off = figures["psnr_colour_fitted"] - figures["psnr"]
     if grade in ("good", "usable") and off > COLOURS_OFF:
         sentence = f"The colours of views are off by as much as costs {off:.1f} dB; what they show is right."

@@ -10,13 +10,16 @@ from stages.evaluate.trivial import BLURS
 MEAN_COLOUR, BLURRED = 16.2, [32.0, 28.8, 25.7, 23.7, 22.0, 20.4]
 
 
-def a_result(psnr: float = 29.4, *, fitted: float | None = None, mean_colour: float = MEAN_COLOUR, blurred: list[float] | None = None) -> dict[str, Any]:
-    """metrics.json of a result of which nothing is bad but for what is given."""
+def a_result(
+    psnr: float = 29.4, *, fitted: float | None = None, mean_colour: float = MEAN_COLOUR, blurred: list[float] | None = None, detail: float | None = None
+) -> dict[str, Any]:
+    """metrics.json of a result of which nothing is bad but for what is given; its detail is as good as it is, unless that is given."""
     blurred, fitted = blurred or BLURRED, psnr if fitted is None else fitted
     quality = {"psnr": psnr, "ssim": 0.9, "psnr_colour_fitted": fitted}
     views = [
-        {"name": f"v{k}.jpg", "asset": dict(quality), "network": dict(quality), "mesh": {"psnr": psnr - 1, "roughness": 0.05}, "splats": {"psnr": psnr},
-         "trivial": {"mean_colour": mean_colour, "blurred": list(blurred)}} for k in range(5)
+        {"name": f"v{k}.jpg", "asset": {**quality, "psnr_detail": fitted if detail is None else detail}, "network": dict(quality),
+         "mesh": {"psnr": psnr - 1, "roughness": 0.05}, "splats": {"psnr": psnr},
+         "trivial": {"mean_colour": mean_colour, "blurred": list(blurred), "blurred_detail": list(blurred)}} for k in range(5)
     ]  # fmt: skip
     return {
         "split": "test",
@@ -37,7 +40,7 @@ def a_result(psnr: float = 29.4, *, fitted: float | None = None, mean_colour: fl
 def _views(part: str, change: float) -> Callable[[dict[str, Any]], None]:
     def worse(found: dict[str, Any]) -> None:
         for each in (found, *found["views"]):
-            for name in ("psnr", "psnr_colour_fitted"):
+            for name in ("psnr", "psnr_colour_fitted", "psnr_detail"):
                 if name in each[part]:
                     each[part][name] -= change
 

@@ -20,7 +20,7 @@ from stages.verdict.grades import GRADES
 from stages.verdict.result import ResultVerdict, verdict_on_result
 from tests.fakes import WHITE, BallField
 from tests.stages.evaluate.balls import TREE, figures_of, job_in, make_scene, measure, problems_of, settings, verdict_of
-from tests.stages.evaluate.results import WORSE, a_result, worse
+from tests.stages.evaluate.results import BLURRED, WORSE, a_result, worse
 from workflows import asset
 
 # Of photographs of real captures at 800 px: PSNR of the mean colour, and of the photographs after blurs; then the asset's, fitted, and what it is.
@@ -41,6 +41,21 @@ CAPTURES = {
 def test_captures_are_graded_as_who_looks_at_them_does(name: str) -> None:
     mean_colour, blurred, psnr, grade = CAPTURES[name]
     assert verdict_on_result(a_result(psnr, mean_colour=mean_colour, blurred=blurred)).grade == grade
+
+
+@pytest.mark.parametrize(
+    ("detail", "blurred", "grade"),
+    [(30.0, BLURRED, "usable"), (23.0, BLURRED, "poor"), (60.0, [50.0, 44.0, 40.0, 38.0, 36.0, 35.0], "poor")],
+    ids=["right", "gone", "none in the photographs"],
+)
+def test_shading_that_differs_is_not_poor_where_the_detail_is_right(detail: float, blurred: list[float], grade: str) -> None:
+    """As of an object on a plain table; of a bare wall behind fog there is no detail that could be right."""
+    found = a_result(22.7, detail=detail)
+    for view in found["views"]:
+        view["trivial"]["blurred_detail"] = blurred
+    verdict = verdict_on_result(found)
+    assert verdict.grade == grade
+    assert ("shading" in verdict.problems[0].cause) == (grade == "usable")
 
 
 SETTINGS = {f"{stage.name}.{name}" for stage in asset.STAGES for name in stage.settings.__dataclass_fields__}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.evaluate.trivial import blurred
+from stages.evaluate.trivial import blurred, blurred_psnrs, detail, equivalent_blur
 
 
 def a_photograph(seed: int = 0, shape: tuple[int, int] = (240, 320)) -> np.ndarray:
@@ -29,3 +29,20 @@ def test_a_blur_is_that_of_a_gaussian(deviation: float) -> None:
     expected = np.einsum("ik,klc,jl->ijc", matrix(90), reflected, matrix(120), optimize=True)
     assert np.abs(blurred(picture, deviation) - expected).max() < 0.02
     assert np.sqrt(np.square(blurred(picture, deviation) - expected).mean()) < 0.004
+
+
+def test_detail_is_what_differs_from_shading() -> None:
+    """A light that changes slowly over the picture leaves it as it is, and a blur takes it away."""
+    picture = a_photograph()
+    light = 0.2 * np.linspace(-1, 1, 320, dtype=np.float32)[None, :, None]
+    assert np.abs(detail(picture + light, None) - detail(picture, None))[20:-20, 20:-20].max() < 0.02
+    scores = blurred_psnrs(detail(picture, None), None)
+    assert scores == sorted(scores, reverse=True)
+    for blur, score in ((0.005, scores[1]), (0.02, scores[3])):
+        assert equivalent_blur(score, scores) == pytest.approx(blur)
+        error = np.square(detail(blurred(picture, blur * 320), None) - detail(picture, None)).mean()
+        assert -10 * np.log10(error) == pytest.approx(score, abs=0.5)
+    mask = np.zeros((240, 320), bool)
+    mask[:, :160] = True
+    other = np.where(mask[..., None], picture, 1 - picture)
+    np.testing.assert_array_equal(detail(other, mask)[mask], detail(picture, mask)[mask])
