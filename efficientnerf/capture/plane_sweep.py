@@ -31,7 +31,7 @@ TRIES = 60  # evaluations of a local search
 AGREE, AGREE_ON_PLANE = 0.6, 0.15  # correlation of a patch that lies on the plane, and least mean of all patches
 APART, LESS = 0.2, 0.6  # of the subject's size: how far above and below the plane patches agree at most so many times as well
 NEIGHBOURS, AGREE_AROUND = 12, 0.8  # patches round one that lies on the plane, and how well they agree at least, over the upper quartile of all
-SAME = 0.05  # of the subject's size: how far apart the planes of two halves of the pairs may be
+SAME = 0.8  # of how well a half of the pairs agrees along the plane that it finds, least along that of the other half
 SHOWN = 0.5  # of the patches, that second photographs should show
 FEWEST = 100  # patches that lie on the plane
 OUTSIDE = -1e6  # pixels: of what a lens does not show
@@ -95,8 +95,8 @@ class SweptPlane:
 def swept_plane(pictures: Sequence[Picture], points: np.ndarray, seed: int, tick: Callable[[float], None] = lambda share: None) -> SweptPlane | None:
     """The nearly level plane, z up, below a subject of which sparse points (N, 3) are known; None where photographs agree along none.
 
-    Two halves of the pairs find it, each by itself, and it is below most points and cameras. What `tick`, which gets the share that is done, raises stops the
-    search.
+    Two halves of the pairs find one each, and agree along each other's. It is below most points and cameras. What `tick`, which gets the share that is done,
+    raises stops the search.
     """
     centres = np.array([picture.centre for picture in pictures]).reshape(-1, 3)
     if len(points) < 3 or len(pictures) < 3:
@@ -117,11 +117,12 @@ def swept_plane(pictures: Sequence[Picture], points: np.ndarray, seed: int, tick
     found = _tried([half.fewer(TRIED, 2) for half in halves], np.arange(lowest - BELOW * size, middle[2], STEP * size), tick)
     if found is None:
         return None
-    (first, own), (second, other) = (half.fewer(FITTED).fitted(found) for half in halves)
-    apart = np.abs(first - second)
-    if min(own, other) < AGREE_ON_PLANE or apart[2] + size * np.hypot(apart[0], apart[1]) > SAME * size:
+    parts = [half.fewer(FITTED) for half in halves]
+    fitted = [part.fitted(found) for part in parts]
+    across = [part.agreement(tilted) / max(own, AGREE_ON_PLANE) for part, (_, own), (tilted, _) in zip(parts, fitted, reversed(fitted), strict=True)]
+    if min(own for _, own in fitted) < AGREE_ON_PLANE or min(across) < SAME:
         return None
-    plane = (first + second) / 2
+    plane = np.mean([tilted for tilted, _ in fitted], axis=0)
     away = np.array([0, 0, APART * size])
     if any(half.agreement(other) > LESS * half.agreement(plane) for half in halves for other in (plane - away, plane + away)):
         return None
