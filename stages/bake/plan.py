@@ -30,6 +30,7 @@ ERROR_MAP = 0.9  # bake.error_map but for forward-facing scenes; docs/experiment
 # bake.view_dependent_lr_ratio without a constant background: for each training view, at least and at most. Of a voxel that few views see, view dependence is
 # overfitted. docs/experiments/tree-training.md
 VIEW_LR_RATIO, MIN_VIEW_DEPENDENT_LR_RATIO, MAX_VIEW_DEPENDENT_LR_RATIO = 0.0025, 0.2, 0.6
+TOTAL_VARIATION, SCENE_TOTAL_VARIATION = 0.01, 0.03  # bake.total_variation, and of unbounded scenes
 
 
 def coarse_cells(grids: Sequence[Grid]) -> int:
@@ -59,7 +60,9 @@ class Bake:
     min_component: float  # size below which components are dropped, over that of the largest one
     refine_steps: int | None  # stated; None: as many as usual for the voxels that there will be
     seconds: float | None  # of the stage, in place of steps; None: it may take any time
-    view_dependent_lr_ratio: float  # of the refinement, as is the next
+    # of the refinement
+    view_dependent_lr_ratio: float
+    total_variation: float
     error_map: float
     # of a scene: (2, 3) that the innermost grid covers where the field was trained on voxels, whose corner is one of theirs; None: the foreground region's
     box: np.ndarray | None
@@ -108,10 +111,12 @@ def bake_plan(settings: BakeSettings, m: Model, s: Scene, device: str, cores: in
     timed = mib is None and seconds is not None and device == "cpu"
     if mib is None:
         mib = timed_mib(usual, seconds, cores, whole=whole, packed=packed) if seconds is not None and timed else usual
-    ratio, error_map = resolved(settings.view_dependent_lr_ratio), resolved(settings.error_map)
+    ratio, smoothness, error_map = (resolved(value) for value in (settings.view_dependent_lr_ratio, settings.total_variation, settings.error_map))
     if ratio is None:
         of_views = float(np.clip(VIEW_LR_RATIO * len(views_of(s, "train")), MIN_VIEW_DEPENDENT_LR_RATIO, MAX_VIEW_DEPENDENT_LR_RATIO))
         ratio = of_views if s.background is None else 1.0
+    if smoothness is None:
+        smoothness = SCENE_TOTAL_VARIATION if whole else TOTAL_VARIATION
     if error_map is None:
         error_map = ERROR_MAP if s.forward is None else 0.0
     return Bake(
@@ -122,7 +127,8 @@ def bake_plan(settings: BakeSettings, m: Model, s: Scene, device: str, cores: in
         max_mib=mib, mib=mib_for_voxels(mib, usual, packed=packed, fixed=bool(side)), usual_mib=usual, timed=timed,
         degree=m.fine.degree, layout=settings.layout, brick_size=brick, environment_size=settings.environment_size if whole else 0,
         min_component=settings.min_component if s.background is None else 0.0,
-        refine_steps=resolved(settings.refine_steps) if seconds is None else None, seconds=seconds, view_dependent_lr_ratio=ratio, error_map=error_map,
+        refine_steps=resolved(settings.refine_steps) if seconds is None else None, seconds=seconds,
+        view_dependent_lr_ratio=ratio, total_variation=smoothness, error_map=error_map,
         box=np.asarray(m.space.bounds, np.float64) if trained else None, cascades=cascades, max_resolution=max_resolution,
     )  # fmt: skip
 

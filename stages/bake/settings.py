@@ -97,8 +97,9 @@ class BakeSettings:
         " images, rising to 0.6 for 240.",
         advanced=True,
     )
-    total_variation: NonNegative = setting(
-        0.01, "Weight of the total variation of the logarithm of the optical thickness between neighbouring voxels.", advanced=True
+    total_variation: NonNegative | Auto = setting(
+        "auto", "Weight of the total variation of the logarithm of the optical thickness between neighbouring voxels; auto: 0.01, or 0.03 in unbounded scenes.",
+        advanced=True,
     )
     error_map: Annotated[float, Meta(ge=0.0, lt=1.0)] | Auto = setting(
         "auto", "Fraction of the refinement's rays that are drawn where earlier errors were large; auto: 0.9, or 0 in forward-facing scenes.", advanced=True
@@ -120,7 +121,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=28,
+    version=29,
     settings=BakeSettings,
     needs=("poses", "train"),
     run=ByName("stages.bake.run:run"),

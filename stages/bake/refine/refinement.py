@@ -112,7 +112,7 @@ class Refinement:
         run = fit.optimise(
             state, self.targets, until=end, rays=settings.refine_rays_per_batch, density_lr=settings.density_lr, sh_lr=settings.sh_lr,
             fall=lambda step: settings.lr_final_ratio ** point.schedule.fraction(step), seed=settings.seed,
-            view_dependent_lr_ratio=self.plan.view_dependent_lr_ratio, total_variation=settings.total_variation, error_map=self.plan.error_map,
+            view_dependent_lr_ratio=self.plan.view_dependent_lr_ratio, total_variation=self.plan.total_variation, error_map=self.plan.error_map,
         )  # fmt: skip
         step_began = clock()
         for error in run:
@@ -230,7 +230,7 @@ def targets_on_device(job: Job, tree: NerfTree, targets: Targets) -> Targets:
     """The targets on the run's device, where the tree is then fitted; on the host where the device's memory is too small."""
     cells = sum(cascade.brick_index.size for cascade in cascades_of(tree))
     voxels = len(tree.density_values)
-    needed = needed_on_device(voxels, tree.harmonics_count, len(tree.voxel_index), cells, tree.brick, smooth=job.settings.total_variation > 0)
+    needed = needed_on_device(voxels, tree.harmonics_count, len(tree.voxel_index), cells, tree.brick, smooth=job.settings.total_variation != 0)
     needed += voxels * bool(tree.outer)  # the cascade of each voxel
     if targets.pixels.images is not None:
         needed += targets.pixels.images.nbytes
