@@ -31,7 +31,7 @@ TRIES = 60  # evaluations of a local search
 AGREE, AGREE_ON_PLANE = 0.6, 0.15  # correlation of a patch that lies on the plane, and least mean of all patches
 APART, LESS = 0.2, 0.6  # of the subject's size: how far above and below the plane patches agree at most so many times as well
 NEIGHBOURS, AGREE_AROUND = 12, 0.8  # patches round one that lies on the plane, and how well they agree at least, over the upper quartile of all
-SAME = 0.8  # of how well a half of the pairs agrees along the plane that it finds, least along that of the other half
+SAME = 0.8  # of how well a half of the photographs agrees along the plane that it finds, least along that of the other half
 SHOWN = 0.5  # of the patches, that second photographs should show
 FEWEST = 100  # patches that lie on the plane
 OUTSIDE = -1e6  # pixels: of what a lens does not show
@@ -95,8 +95,8 @@ class SweptPlane:
 def swept_plane(pictures: Sequence[Picture], points: np.ndarray, seed: int, tick: Callable[[float], None] = lambda share: None) -> SweptPlane | None:
     """The nearly level plane, z up, below a subject of which sparse points (N, 3) are known; None where photographs agree along none.
 
-    Two halves of the pairs find one each, and agree along each other's. It is below most points and cameras. What `tick`, which gets the share that is done,
-    raises stops the search.
+    Two halves of the photographs find one each, and agree along each other's. It is below most points and cameras. What `tick`, which gets the share that is
+    done, raises stops the search.
     """
     centres = np.array([picture.centre for picture in pictures]).reshape(-1, 3)
     if len(points) < 3 or len(pictures) < 3:
@@ -108,10 +108,9 @@ def swept_plane(pictures: Sequence[Picture], points: np.ndarray, seed: int, tick
     size, lowest = 2 * float(np.median(np.linalg.norm(near - middle, axis=1))), float(np.percentile(near[:, 2], LOWEST))
     if not size > 0:
         return None
-    pairs = _pairs(centres - middle)
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 10, 0]))
     stack = _Stack(pictures)
-    halves = [_Patches(stack, pairs[begin::2], middle, lowest, size, rng) for begin in (0, 1)]
+    halves = [_Patches(stack, begin + 2 * _pairs(centres[begin::2] - middle), middle, lowest, size, rng) for begin in (0, 1)]
     if min(len(half.pair) for half in halves) < FEWEST:
         return None
     found = _tried([half.fewer(TRIED, 2) for half in halves], np.arange(lowest - BELOW * size, middle[2], STEP * size), tick)

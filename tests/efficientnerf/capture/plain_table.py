@@ -10,7 +10,7 @@ WIDTH, HEIGHT = 160, 120
 NORMAL, LEVEL = np.array([-0.04, 0.02, 1.0]), -0.3  # of the table, and z where x and y are 0
 
 
-def cameras(count: int = 12) -> list[Camera]:
+def cameras(count: int = 24) -> list[Camera]:
     """In a circle, through a lens that distorts."""
     lens = (190.0, WIDTH / 2, HEIGHT / 2, -0.05)
     turns = np.arange(count) * 2 * np.pi / count

@@ -62,7 +62,7 @@ def test_patches_keep_away_from_the_subject_and_from_what_is_masked(table: list[
 
 
 def test_a_patch_correlates_along_the_table_alone(table: list[np.ndarray]) -> None:
-    made = pictures(table)
+    made = pictures(table)[::2]
     stack = plane_sweep._Stack(made)
     patches = plane_sweep._Patches(stack, plane_sweep._pairs(stack.centres), np.zeros(3), LEVEL, 0.8, np.random.default_rng(0))
     slopes = NORMAL[:2] / NORMAL[2]
