@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
-from efficientnerf.capture.supports import along
+from efficientnerf.capture.supports import along, near_points
 from efficientnerf.geometry.cameras import Camera, project, resized
 
 # docs/experiments/plane-sweep.md
@@ -49,10 +49,10 @@ class Picture:
     centre: np.ndarray
 
 
-def picture_of(grey: np.ndarray, usable: np.ndarray, camera: Camera, points: np.ndarray, most: int = PIXELS) -> Picture:
-    """Of a photograph (H, W) uint8 and its pixels that count (H, W) bool, reduced to at most so many pixels; where sparse points (N, 3) are near it is not
+def picture_of(grey: np.ndarray, usable: np.ndarray, camera: Camera, points: np.ndarray) -> Picture:
+    """Of a photograph (H, W) uint8 and its pixels that count (H, W) bool, reduced to at most PIXELS; where sparse points (N, 3) are near it is not
     clear."""
-    scale = min(1.0, (most / grey.size) ** 0.5)
+    scale = min(1.0, (PIXELS / grey.size) ** 0.5)
     width, height = (max(2, round(length * scale)) for length in (camera.width, camera.height))
     lens = (reduced := resized(camera, width, height)).intrinsics
     matrix = np.array([[lens["fx"], 0, lens["cx"] - 0.5], [0, lens["fy"], lens["cy"] - 0.5], [0, 0, 1]])
@@ -101,13 +101,10 @@ def swept_plane(pictures: Sequence[Picture], points: np.ndarray, seed: int, tick
     centres = np.array([picture.centre for picture in pictures]).reshape(-1, 3)
     if len(points) < 3 or len(pictures) < 3:
         return None
-    middle = np.median(points, axis=0)
-    near = points[np.linalg.norm(points - middle, axis=1) <= np.median(np.linalg.norm(centres - middle, axis=1))]
-    if len(near) < 3:
-        return None
-    size, lowest = 2 * float(np.median(np.linalg.norm(near - middle, axis=1))), float(np.percentile(near[:, 2], LOWEST))
+    middle, near, size = near_points(points, centres)
     if not size > 0:
         return None
+    lowest = float(np.percentile(near[:, 2], LOWEST))
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 10, 0]))
     stack = _Stack(pictures)
     halves = [_Patches(stack, begin + 2 * _pairs(centres[begin::2] - middle), middle, lowest, size, rng) for begin in (0, 1)]

@@ -122,10 +122,7 @@ def level_plane(points: np.ndarray, cameras: np.ndarray, up: np.ndarray, tilt: f
     """
     if len(points) < 3:
         return None
-    middle = np.median(points, axis=0)
-    distance, reach = np.linalg.norm(points - middle, axis=1), float(np.median(np.linalg.norm(cameras - middle, axis=1)))
-    near = points[distance <= reach]
-    size = 2 * float(np.median(np.linalg.norm(near - middle, axis=1))) if len(near) else 0.0
+    _, near, size = near_points(points, cameras)
     found = _plane(near[:: max(1, len(near) // MAX_POINTS)], FLAT * size, up, float(np.cos(np.radians(tilt))))
     if found is None:
         return None
@@ -134,6 +131,13 @@ def level_plane(points: np.ndarray, cameras: np.ndarray, up: np.ndarray, tilt: f
     flat = on @ _axes_across(normal).T
     broad = len(on) >= MIN_ON_LEVEL * len(near) and np.sqrt(np.linalg.eigvalsh(np.cov(flat.T))[0]) >= MIN_BROAD * size
     return (normal, offset) if broad and (along(cameras, normal) > offset).mean() >= 0.8 and normal @ up > np.cos(np.radians(tilt)) else None
+
+
+def near_points(points: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Of points (N, 3) the middle one (3,), those that are nearer to it than the usual camera (C, 3) is, and about how large what these show is."""
+    middle = np.median(points, axis=0)
+    near = points[np.linalg.norm(points - middle, axis=1) <= float(np.median(np.linalg.norm(cameras - middle, axis=1)))]
+    return middle, near, 2 * float(np.median(np.linalg.norm(near - middle, axis=1))) if len(near) else 0.0
 
 
 @dataclass(frozen=True, eq=False)
