@@ -49,7 +49,13 @@ NO_POINTS = np.zeros((0, 3))
 
 
 def find_subject(
-    points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera], *, weights: np.ndarray | None = None
+    points: np.ndarray,
+    views: np.ndarray,
+    pixels: np.ndarray,
+    cameras: Sequence[Camera],
+    *,
+    weights: np.ndarray | None = None,
+    known: Plane | None = None,
 ) -> Foreground | None:
     """The foreground of a capture, in the training frame; None where the rays say too little.
 
@@ -58,6 +64,7 @@ def find_subject(
     pixels   (P, 2) x, y in its image, from -1 to 1
     cameras  in the training frame, z up
     weights  (P,) opacity of each ray; None: 1. Rays of less than half end nowhere
+    known    the plane of the table or floor, where there is one: see `efficientnerf.capture.supports.find_supports`
 
     Deterministic. A few thousand rays of each photograph are enough.
     """
@@ -91,7 +98,7 @@ def find_subject(
     observed = close & (share >= OBSERVED)
     if not observed.any():
         return Foreground(_region_of(cells.centres[trusted], cells.side), cells.side, NO_POINTS)
-    planes, support, hidden = find_supports(cells, observed, close, rays_that_end(points, views, pixels, cameras), centres, reach)
+    planes, support, hidden = find_supports(cells, observed, close, rays_that_end(points, views, pixels, cameras), centres, reach, known)
     level = any(normal[2] > 0.8 for normal, _ in planes)
     candidates = close & ~support & ~hidden & (share >= REACHED)
     subject = _subject(cells, candidates, observed)

@@ -59,18 +59,21 @@ def rays_that_end(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cam
 
 
 def find_supports(
-    cells: Cells, observed: np.ndarray, close: np.ndarray, rays: Rays, cameras: np.ndarray, reach: float
+    cells: Cells, observed: np.ndarray, close: np.ndarray, rays: Rays, cameras: np.ndarray, reach: float, known: Plane | None = None
 ) -> tuple[list[Plane], np.ndarray, np.ndarray]:
     """The planes that support the subject, unit normals towards the cameras and offsets, the cells (M,) on them, and the cells behind one.
 
     A plane supports where it holds many cells, the cameras (C, 3) are on one side of it, and so is most of the rest that the photographs' middles show.
+
+    known  one that photographs or sparse points show to support it: what rays do at its edge, where nothing else keeps fog away, does not refute it
     """
     tolerance = max(1.5 * cells.side, 0.03 * reach)
     support, hidden = np.zeros(len(observed), bool), np.zeros(len(observed), bool)
     planes: list[Plane] = []
     left = observed.copy()
-    for _ in range(MAX_PLANES):
-        found = _plane(cells.centres[left], tolerance)
+    for number in range(MAX_PLANES):
+        is_known = number == 0 and known is not None
+        found = known if is_known else _plane(cells.centres[left], tolerance)
         if found is None or len(planes) == MAX_SUPPORTS:
             break
         normal, offset = found
@@ -79,12 +82,15 @@ def find_supports(
         height = along(cells.centres, normal) - offset
         on = left & (np.abs(height) <= tolerance)
         if on.sum() < MIN_SUPPORT * observed.sum():
+            if is_known:
+                continue
             break
-        left &= ~on
         before, behind = (float(cells.central[close & part].sum()) for part in (height > tolerance, height < -tolerance))
-        if (cameras @ normal > offset + tolerance).mean() < 0.8 or behind > MAX_BEHIND * before:
+        refuted = (cameras @ normal > offset + tolerance).mean() < 0.8 or behind > MAX_BEHIND * before
+        if is_known and refuted:
             continue
-        if not _supports((normal, offset), cells, on, close & (height > tolerance), rays, tolerance, reach):
+        left &= ~on
+        if refuted or not (is_known or _supports((normal, offset), cells, on, close & (height > tolerance), rays, tolerance, reach)):
             continue
         support |= np.abs(height) <= tolerance
         hidden |= height < -tolerance

@@ -26,6 +26,7 @@ class SparseDepthRays:
     directions: np.ndarray
     distance: np.ndarray  # (A,) float32, to the point
     on_support: np.ndarray  # (A,) bool, those last: the point is on the plane that the subject stands on, and something may stand before it
+    plane: tuple[np.ndarray, float] | None = None  # of the support: its normal (3,), upwards, and offset
 
     def __len__(self) -> int:
         return len(self.distance)

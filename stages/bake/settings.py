@@ -121,7 +121,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=29,
+    version=30,
     settings=BakeSettings,
     needs=("poses", "train"),
     run=ByName("stages.bake.run:run"),

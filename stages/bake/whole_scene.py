@@ -27,6 +27,7 @@ from efficientnerf.asset.field_samples import (
 )
 from efficientnerf.asset.tree import Region
 from efficientnerf.capture.foreground import find_subject
+from efficientnerf.capture.supports import Plane
 from efficientnerf.model import Model
 from efficientnerf.rendering.environment import lookup
 from efficientnerf.training.pixels import Pixels
@@ -39,6 +40,7 @@ from stages.framing.view_coverage import MAX_CONTRADICTED, close_to_path, kept_p
 from stages.io import scene
 from stages.io.scene import Scene
 from stages.reports import bounds_are_given
+from stages.train import support
 from stages.train.priors import filled_points
 
 # Of the near plane's distance: how far from the cameras' path nothing is baked. Less than in training, which masks whole density voxels alone: what it learned
@@ -86,7 +88,7 @@ class Cascades:
             ),
         )  # fmt: skip
         job.safe_point()
-        self.region = region_of(self.samples.training, pixels, s, job.inputs["poses"])
+        self.region = region_of(self.samples.training, pixels, s, job.inputs["poses"], support.load(job.inputs["train"]))
         self.bounds = innermost_box(self.region, s.bounds) if plan.box is None else plan.box
         self.count = cascades_needed(self.samples.training, self.bounds, *plan.cascades)
         self.finest = plan.resolution if plan.fixed else finest_of_cascades(s, self.bounds, self.count, plan.brick_size, plan.max_resolution)
@@ -188,14 +190,17 @@ def cascades_needed(samples: FieldSamples, bounds: np.ndarray, least: int, most:
     return int(np.argmax(np.append(beyond[:-1] <= MAX_BEYOND * max(weight.sum(), 1e-9), True))) + 1
 
 
-def region_of(samples: FieldSamples, pixels: Pixels, s: Scene, poses: Path) -> Region:
-    """The foreground region; the scene bounds where they were given by hand (poses.crop_box), and where the field says too little."""
+def region_of(samples: FieldSamples, pixels: Pixels, s: Scene, poses: Path, known: Plane | None = None) -> Region:
+    """The foreground region; the scene bounds where they were given by hand (poses.crop_box), and where the field says too little.
+
+    known  the plane of the table or floor, where training found it
+    """
     if bounds_are_given(poses):
         return Region(np.asarray(s.bounds, np.float64))
     every = slice(None, None, max(1, len(samples.pixel) // FOREGROUND_RAYS))
     cameras = [one.camera for one in scene.views_of(s, "train")]
     place = picture_places(samples, pixels, every)
-    found = find_subject(surface_points(samples)[every], samples.view[every], place, cameras, weights=samples.opacity[every])
+    found = find_subject(surface_points(samples)[every], samples.view[every], place, cameras, weights=samples.opacity[every], known=known)
     return Region(np.asarray(s.bounds, np.float64)) if found is None else found.region
 
 

@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -181,11 +183,13 @@ def _with_support(found: SparseDepthRays, support: Support, views: tuple[View, .
         meets = np.flatnonzero(np.isfinite(distance))[:each]
         parts.append((origins[meets], directions[meets], distance[meets]))
     origins, directions, distance = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return _joined(found, _rays(origins, directions, distance, on_support=True))
+    return replace(_joined(found, _rays(origins, directions, distance, on_support=True)), plane=(support.normal, support.offset))
 
 
 def _joined(first: SparseDepthRays, second: SparseDepthRays) -> SparseDepthRays:
-    return SparseDepthRays(**{name: np.concatenate([values, getattr(second, name)]) for name, values in vars(first).items()})
+    arrays = ("origins", "directions", "distance", "on_support")
+    joined: dict[str, Any] = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in arrays}
+    return replace(first, **joined)
 
 
 def _rays(origins: np.ndarray, directions: np.ndarray, distance: np.ndarray, *, on_support: bool) -> SparseDepthRays:

@@ -24,6 +24,7 @@ from stages.compiling import clock, running_kernels
 from stages.cores import use_all_cores
 from stages.io import field_file, scene
 from stages.io.scene import Scene, View
+from stages.train import support
 from stages.train.budget import UNKNOWN, Budget, training_budget
 from stages.train.checkpoints import Checkpoints
 from stages.train.checks.watch import Watch
@@ -35,7 +36,6 @@ from stages.train.log import TrainLog
 from stages.train.memory import rows_for_training
 from stages.train.previews import Previews
 from stages.train.priors import Prior, cells_closed_at_first, mask_uncovered_cells
-from stages.train.sweep import find_plane
 
 
 @running_kernels
@@ -95,6 +95,7 @@ def trained(job: Job) -> bool:
     field_file.save_model(m, near, far, outputs.field, saved_exposure(t.exposure, s), t.schedule)
     write_cameras(outputs, t, views, folder, renderer)
     watch.write_choices(outputs.choices)
+    support.write(support.load(job.work), outputs.support)
     write_report(outputs.report, job, t, log.seconds, previews.figures | watch.report() | {"wrong_views": findings_of(t, views)}, priors)
     log.publish(outputs.log, outputs.curve)
     previews.publish(outputs.previews, job.warn)
@@ -106,11 +107,12 @@ def sparse_depth(job: Job, folder: Path, s: Scene, m: Model, pixels: Pixels, vie
     settings, searched = m.settings, partial(job.reached, total=1.0, text="searching for the plane of the table or floor")
 
     def sweep(points: np.ndarray) -> SweptPlane | None:
-        return find_plane(s, pixels, views, points, settings.seed, searched) if settings.sparse_depth_loss_weight > 0 and m.space.unbounded else None
+        return support.find_plane(s, pixels, views, points, settings.seed, searched) if settings.sparse_depth_loss_weight > 0 and m.space.unbounded else None
 
     found = sparse_depth_of(folder, s, settings.seed, sweep)
     if found is None and s.points and settings.sparse_depth_loss_weight > 0:
         job.say("no sparse point is in front of enough of the training cameras that observe it; train.sparse_depth_loss_weight has no effect")
+    support.write(None if found is None else found.plane, job.work / TrainOutputs.support)
     if found is not None and found.on_support.any():
         job.say(f"the subject stands on a plane, where rays end: {int(found.on_support.sum())} rays to it are trained on")
     return found

@@ -33,7 +33,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="train",
-    version=23,
+    version=24,
     settings=TrainSettings,
     needs=("poses",),
     run=ByName("stages.train.run:run"),

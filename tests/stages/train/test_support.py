@@ -9,14 +9,15 @@ import pytest
 
 from efficientnerf.capture.plane_sweep import SweptPlane
 from efficientnerf.training.pixels import Pixels
+from pipeline.errors import CorruptArtifact
 from stages.io import scene as scenes
 from stages.io.capture import SparsePoints
 from stages.io.png import write_png
 from stages.io.scene import Scene, View
 from stages.train import run as train
-from stages.train import sweep
+from stages.train import support
 from stages.train.data import pixels_of, sparse_depth_of
-from stages.train.sweep import find_plane
+from stages.train.support import find_plane
 from tests.efficientnerf.balls import settings
 from tests.efficientnerf.capture.plain_table import LEVEL, NORMAL, cameras, height, photograph, subject
 from tests.stages.balls import ORBIT, SIMILARITY, job
@@ -107,7 +108,7 @@ def test_views_that_are_left_out_and_those_beyond_the_most_are_not_compared(tmp_
     plane = find_plane(fewer, pixels, views, subject(), 0, lambda share: None)
     assert plane is not None
     assert not (plane.cameras == s.views[3].camera.centre).all(axis=-1).any()
-    monkeypatch.setattr(sweep, "MOST_PHOTOGRAPHS", 2)
+    monkeypatch.setattr(support, "MOST_PHOTOGRAPHS", 2)
     assert find_plane(s, pixels, views, subject(), 0, lambda share: None) is None, "two are too few"
 
 
@@ -118,3 +119,16 @@ def test_training_reports_the_plane_and_asks_for_it_where_it_counts(tmp_path: Pa
     few = settings(iterations=3, sample_batch_size=1024, occupancy_warmup_steps=2, preview_every=5, sparse_depth_loss_weight=weight)
     train.run(job(tmp_path, few, poses=tmp_path / "poses", events=events))
     assert any("the subject stands on a plane" in str(event.get("text")) for event in events) == (weight > 0)
+    plane = support.load(tmp_path / "out")
+    assert (plane is not None) == (weight > 0), "later stages know it too"
+    if plane is not None:
+        length = np.linalg.norm(NORMAL)
+        np.testing.assert_allclose(plane[0], NORMAL / length, atol=0.02)
+        assert plane[1] == pytest.approx(LEVEL / length, abs=0.02)
+
+
+@pytest.mark.parametrize("text", ["{", '{"format": 2, "normal": [0, 0, 1], "offset": 0}', '{"format": 1, "normal": [0, 0], "offset": 0}'])
+def test_a_damaged_plane_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "support.json").write_text(text)
+    with pytest.raises(CorruptArtifact):
+        support.load(tmp_path)
