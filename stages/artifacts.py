@@ -65,7 +65,7 @@ class TrainOutputs(Outputs):
     field = Name("field.safetensors")  # stages.io.field_file: fields, density voxels, the schedule, exposure where it was learned
     cameras = Name("cameras.json")  # training cameras where they changed, and views left out; stages.io.refined_cameras
     choices = Name("choices.json")  # what training did otherwise than scene and settings state, where it learned nothing; stages.train.choices
-    support = Name("support.json")  # the plane of the table or floor that the subject stands on, where one was found; stages.train.support
+    support = Name("support.json")  # planes of a table, floor or wall that support the subject, where any was found; stages.train.support
     wrong_views = Name("wrong_views.png")  # photographs and renders of the views that were left out or got other poses
     report = Name("report.json")  # steps, seconds, and the settings that give the same field again
     log = Name("log.jsonl")  # a line every few steps

@@ -55,7 +55,7 @@ def find_subject(
     cameras: Sequence[Camera],
     *,
     weights: np.ndarray | None = None,
-    known: Plane | None = None,
+    known: Sequence[Plane] = (),
 ) -> Foreground | None:
     """The foreground of a capture, in the training frame; None where the rays say too little.
 
@@ -64,7 +64,7 @@ def find_subject(
     pixels   (P, 2) x, y in its image, from -1 to 1
     cameras  in the training frame, z up
     weights  (P,) opacity of each ray; None: 1. Rays of less than half end nowhere
-    known    the plane of the table or floor, where there is one: see `efficientnerf.capture.supports.find_supports`
+    known    planes that support the subject: see `efficientnerf.capture.supports.find_supports`
 
     Deterministic. A few thousand rays of each photograph are enough.
     """

@@ -1,11 +1,12 @@
-"""The plane that a subject stands on, where a table has too little texture for features: that along which photographs agree (plane sweeping, Collins 1996).
+"""The plane that a subject stands on or hangs on, where a table or wall has too little texture for features: that along which photographs agree (plane
+sweeping, Collins 1996).
 
 A patch of faint grain says little; thousands of them in pairs of photographs agree on one plane. V photographs, E pairs of them, P patches of S samples.
 """
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -24,8 +25,10 @@ NARROW, WIDE, BEST = 5.0, 35.0, 15.0  # degrees between two cameras of a pair, r
 PAIRS, PATCHES, FITTED, TRIED = 2, 96, 24, 6  # pairs of a photograph; patches of a pair: of all, to fit a plane, and while many are tried
 AROUND = 2.0  # sizes of the subject, within which patches are
 NEAR_POINTS = 0.04  # of a picture's width: how far sparse points are from a patch
-TILTS, TILT = 2, 4.0  # planes that are tried to either side of level, along x and y, and degrees from one to the next
-BELOW, STEP = 0.3, 0.03  # of the subject's size: how far below it planes are tried, and how far apart
+TILTS, TILT = 2, 4.0  # planes that are tried to either side of one, along x and y, and degrees from one to the next
+TURNS, TURN = 10, 6.0  # directions that a wall may face, to either side of where the photographs are taken from, and degrees from one to the next
+ALL_ROUND, FROM_ABOVE = 90.0, 0.5  # degrees without cameras, from which a wall is looked for; horizontal part of the mean view direction, at least
+BELOW, BEHIND, STEP = 0.3, 0.9, 0.03  # of the subject's size: how far below it, and behind it, planes are tried, and how far apart
 LOWEST = 1.0  # per cent of the sparse points that may be below what is tried
 TRIES = 60  # evaluations of a local search
 AGREE, AGREE_ON_PLANE = 0.6, 0.15  # correlation of a patch that lies on the plane, and least mean of all patches
@@ -98,32 +101,95 @@ def swept_plane(pictures: Sequence[Picture], points: np.ndarray, seed: int, tick
     Two halves of the photographs find one each, and agree along each other's. It is below most points and cameras. What `tick`, which gets the share that is
     done, raises stops the search.
     """
+    if (sweep := _sweep(pictures, points, np.eye(3), BELOW, seed)) is None:
+        return None
+    slopes = np.tan(np.radians(TILT * np.arange(-TILTS, TILTS + 1)))
+    tried = [(sweep.axes, np.array([across, down])) for across in slopes for down in slopes]
+    return _agreed(sweep, tried, tick)
+
+
+def wall_faces(cameras: Sequence[Camera], points: np.ndarray) -> float | None:
+    """About which azimuth a wall behind a subject of sparse points (N, 3) faces; None where photographs are taken from all round, or from above."""
+    if len(cameras) < 3 or len(points) < 3:
+        return None
+    back = -np.mean([camera.forward for camera in cameras], axis=0)
+    azimuth = np.sort(np.arctan2(*(np.array([camera.centre for camera in cameras]) - np.median(points, axis=0))[:, 1::-1].T))
+    gap = float(np.degrees(np.diff(np.append(azimuth, azimuth[0] + 2 * np.pi)).max()))
+    return float(np.arctan2(back[1], back[0])) if np.hypot(*back[:2]) >= FROM_ABOVE and gap >= ALL_ROUND else None
+
+
+def swept_wall(
+    pictures: Sequence[Picture], points: np.ndarray, faces: float, seed: int, tick: Callable[[float], None] = lambda share: None
+) -> SweptPlane | None:
+    """The nearly upright plane behind such a subject, which faces about an azimuth, found in the same way."""
+    angles = faces + np.radians(TURN) * np.arange(-TURNS, TURNS + 1)
+    axes = [np.array([[-np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0], [np.cos(angle), np.sin(angle), 0.0]]) for angle in angles]
+    sweep = _sweep(pictures, points, axes[TURNS], BEHIND, seed)
+    return None if sweep is None else _agreed(sweep, [(each, np.zeros(2)) for each in axes], tick)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sweep:
+    """Two halves of the photographs, to be swept by planes that are about at right angles to the last of three axes."""
+
+    axes: np.ndarray  # (3, 3) rows
+    halves: list["_Patches"]
+    near: np.ndarray  # (N, 3) sparse points of the subject
+    middle: np.ndarray  # (3,) of them
+    size: float  # of the subject
+    below: float  # of its size: how far below its lowest points planes are tried
+
+    def turned(self, axes: np.ndarray) -> "_Sweep":
+        """By planes that are about at right angles to the last of other axes."""
+        return replace(self, axes=axes, halves=[half.turned(axes) for half in self.halves])
+
+    @property
+    def heights(self) -> np.ndarray:
+        """Where planes are tried, along the last axis."""
+        return np.arange(_lowest(self.near, self.axes) - self.below * self.size, float(self.middle @ self.axes[2]), STEP * self.size)
+
+
+def _lowest(near: np.ndarray, axes: np.ndarray) -> float:
+    return float(np.percentile(along(near, axes[2]), LOWEST))
+
+
+def _sweep(pictures: Sequence[Picture], points: np.ndarray, axes: np.ndarray, below: float, seed: int) -> _Sweep | None:
+    """None where there is too little to be compared."""
     centres = np.array([picture.centre for picture in pictures]).reshape(-1, 3)
     if len(points) < 3 or len(pictures) < 3:
         return None
     middle, near, size = near_points(points, centres)
     if not size > 0:
         return None
-    lowest = float(np.percentile(near[:, 2], LOWEST))
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 10, 0]))
-    stack = _Stack(pictures)
-    halves = [_Patches(stack, begin + 2 * _pairs(centres[begin::2] - middle), middle, lowest, size, rng) for begin in (0, 1)]
-    if min(len(half.pair) for half in halves) < FEWEST:
+    stack, lowest = _Stack(pictures), _lowest(near, axes)
+    halves = [_Patches(stack, begin + 2 * _pairs(centres[begin::2] - middle), axes, middle, lowest, size, rng) for begin in (0, 1)]
+    return _Sweep(axes, halves, near, middle, size, below) if min(len(half.pair) for half in halves) >= FEWEST else None
+
+
+def _agreed(sweep: _Sweep, tried: Sequence[tuple[np.ndarray, np.ndarray]], tick: Callable[[float], None]) -> SweptPlane | None:
+    """The plane that both halves agree on, near the best of those with some axes (3, 3) and slopes (2,) along them."""
+    fewer, best, begin = replace(sweep, halves=[half.fewer(TRIED, 2) for half in sweep.halves]), 0.0, None
+    for done, (axes, slopes) in enumerate(tried):
+        tick(done / len(tried))
+        part = fewer if axes is sweep.axes else fewer.turned(axes)
+        for height in part.heights:
+            agreement = sum(half.agreement(np.append(slopes, height)) for half in part.halves)
+            if agreement > best:
+                best, begin = agreement, (axes, np.append(slopes, height))
+    if begin is None:
         return None
-    found = _tried([half.fewer(TRIED, 2) for half in halves], np.arange(lowest - BELOW * size, middle[2], STEP * size), tick)
-    if found is None:
-        return None
+    halves = sweep.turned(begin[0]).halves
     parts = [half.fewer(FITTED) for half in halves]
-    fitted = [part.fitted(found) for part in parts]
+    fitted = [part.fitted(begin[1]) for part in parts]
     across = [part.agreement(tilted) / max(own, AGREE_ON_PLANE) for part, (_, own), (tilted, _) in zip(parts, fitted, reversed(fitted), strict=True)]
     if min(own for _, own in fitted) < AGREE_ON_PLANE or min(across) < SAME:
         return None
-    plane = np.mean([tilted for tilted, _ in fitted], axis=0)
-    away = np.array([0, 0, APART * size])
+    plane, away = np.mean([tilted for tilted, _ in fitted], axis=0), np.array([0, 0, APART * sweep.size])
     if any(half.agreement(other) > LESS * half.agreement(plane) for half in halves for other in (plane - away, plane + away)):
         return None
-    normal, offset = _plane(plane, middle)
-    if np.median(along(near, normal)) < offset or (along(centres, normal) > offset).mean() < 0.8:
+    (normal, offset), centres = halves[0].plane(plane), halves[0].stack.centres
+    if np.median(along(sweep.near, normal)) < offset or (along(centres, normal) > offset).mean() < 0.8:
         return None
     on = [half.on(plane) for half in halves]
     xyz, shown = np.concatenate([at for at, _ in on]), np.concatenate([numbers for _, numbers in on])
@@ -140,17 +206,12 @@ def _pairs(towards: np.ndarray) -> np.ndarray:
     return np.stack([first, order[first, rank]], axis=1)
 
 
-def _plane(tilted: np.ndarray, middle: np.ndarray) -> tuple[np.ndarray, float]:
-    """Normal and offset of a plane as slopes along x and y, and its height at the middle."""
-    normal = np.array([tilted[0], tilted[1], 1.0]) / np.sqrt(1 + tilted[0] ** 2 + tilted[1] ** 2)
-    return normal, float(normal @ [middle[0], middle[1], tilted[2]])
-
-
 class _Stack:
     """All pictures end to end."""
 
     def __init__(self, pictures: Sequence[Picture]) -> None:
         self.pictures, self.centres = pictures, np.array([picture.centre for picture in pictures])
+        self.matrix, self.rotation = (np.array([getattr(picture, name) for picture in pictures]) for name in ("matrix", "rotation"))
         shapes = np.array([picture.detail.shape for picture in pictures])
         self.width, self.height = shapes[:, 1], shapes[:, 0]
         self.begin = np.concatenate([[0], np.cumsum(self.width * self.height)])
@@ -161,8 +222,10 @@ class _Stack:
 class _Patches:
     """Patches of the first photographs of pairs, to be found in the second ones."""
 
-    def __init__(self, stack: _Stack, pairs: np.ndarray, middle: np.ndarray, lowest: float, size: float, rng: np.random.Generator) -> None:
-        self.stack, self.pairs, self.middle, self.size = stack, pairs, middle, size
+    def __init__(
+        self, stack: _Stack, pairs: np.ndarray, axes: np.ndarray, middle: np.ndarray, lowest: float, size: float, rng: np.random.Generator
+    ) -> None:
+        self.stack, self.pairs, self.axes, self.middle, self.size = stack, pairs, axes, middle, size
         chosen = [self._chosen(stack.pictures[first], lowest, rng) for first, _ in pairs]
         self.pair = np.repeat(np.arange(len(pairs)), [len(each) for each in chosen])
         self.at = np.concatenate(chosen) if chosen else np.zeros((0, 2), int)  # (P, 2) x, y
@@ -171,15 +234,33 @@ class _Patches:
         x, y = (self.at[:, None] + self.window[:, :2].astype(int)).transpose(2, 0, 1)
         own = pairs[self.pair, 0][:, None]
         self.own = _normalised(stack.detail[stack.begin[own] + y * stack.width[own] + x])
+        first, second = pairs.T
+        back, turned = np.linalg.inv(stack.matrix[first]), stack.matrix[second] @ stack.rotation[second].transpose(0, 2, 1)
+        # of the homographies from each first photograph to its second one: without a plane, and what a plane adds (see `correlations`)
+        self.far = turned @ stack.rotation[first] @ back
+        self.shift = np.einsum("eij,ej->ei", turned, stack.centres[first] - stack.centres[second])
+        self.towards = stack.rotation[first] @ back
+
+    def plane(self, tilted: np.ndarray) -> tuple[np.ndarray, float]:
+        """Normal and offset of a plane as slopes along the first two axes, and its height along the third at the middle."""
+        normal = np.array([tilted[0], tilted[1], 1.0]) / np.sqrt(1 + tilted[0] ** 2 + tilted[1] ** 2)
+        return self.axes.T @ normal, float(normal @ [*self.axes[:2] @ self.middle, tilted[2]])
+
+    def turned(self, axes: np.ndarray) -> "_Patches":
+        """The same patches, with planes along other axes."""
+        part = copy(self)
+        part.axes = axes
+        return part
 
     def _chosen(self, picture: Picture, lowest: float, rng: np.random.Generator) -> np.ndarray:
         """(P, 2) pixels with detail that see the surroundings of the subject, at the height of its lowest points."""
-        x, y, towards = _rays(picture)
+        x, y, towards = _rays(picture, self.axes)
+        centre = self.axes @ picture.centre
         with np.errstate(divide="ignore", invalid="ignore"):
-            distance = (lowest - picture.centre[2]) / towards[:, 2]
-            at = picture.centre + distance[:, None] * towards
+            distance = (lowest - centre[2]) / towards[:, 2]
+            at = centre + distance[:, None] * towards
         with np.errstate(invalid="ignore", over="ignore"):
-            around = (distance > 0) & (np.hypot(*(at[:, :2] - self.middle[:2]).T) <= AROUND * self.size)
+            around = (distance > 0) & (np.hypot(*(at[:, :2] - self.axes[:2] @ self.middle).T) <= AROUND * self.size)
         square = cv2.boxFilter(picture.detail**2, -1, (SIDE, SIDE)) - cv2.boxFilter(picture.detail, -1, (SIDE, SIDE)) ** 2
         pixels = np.flatnonzero(around & (picture.clear & (square > LEAST_DETAIL**2)).ravel())
         pixels = rng.choice(pixels, min(len(pixels), PATCHES), replace=False)
@@ -195,8 +276,10 @@ class _Patches:
 
     def correlations(self, tilted: np.ndarray) -> np.ndarray:
         """(P,) of each patch with what the second photograph shows of it if it lies on a plane; NaN where that is not clear."""
-        (normal, offset), stack = _plane(tilted, self.middle), self.stack
-        to = np.array([_homography(stack.pictures[first], stack.pictures[second], normal, offset) for first, second in self.pairs])
+        (normal, offset), stack = self.plane(tilted), self.stack
+        height = offset - along(stack.centres[self.pairs[:, 0]], normal)
+        height[height == 0] = 1e-12
+        to = self.far + self.shift[:, :, None] * np.einsum("eij,i->ej", self.towards, normal)[:, None] / height[:, None, None]
         pixels = np.concatenate([self.at, np.ones((len(self.at), 1))], axis=1)[:, None] + self.window
         other = np.einsum("pij,psj->psi", to[self.pair], pixels)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -231,45 +314,24 @@ class _Patches:
 
     def on(self, tilted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where patches that lie on a plane are (P, 3), and the two pictures of each (P, 2)."""
-        normal, offset = _plane(tilted, self.middle)
+        normal, offset = self.plane(tilted)
         correlations = self.correlations(tilted)
         seen = np.flatnonzero(np.isfinite(correlations))
-        xyz, correlation, pairs = np.empty((len(seen), 3)), correlations[seen], self.pairs[self.pair[seen]]
-        for row, patch in enumerate(seen):
-            picture = self.stack.pictures[pairs[row, 0]]
-            towards = picture.rotation @ np.linalg.solve(picture.matrix, [*self.at[patch], 1])
-            xyz[row] = picture.centre + (offset - normal @ picture.centre) / (normal @ towards) * towards
+        correlation, pairs = correlations[seen], self.pairs[self.pair[seen]]
+        towards = np.einsum("pij,pj->pi", self.towards[self.pair[seen]], np.concatenate([self.at[seen], np.ones((len(seen), 1))], axis=1))
+        centres = self.stack.centres[pairs[:, 0]]
+        xyz = centres + ((offset - along(centres, normal)) / along(towards, normal))[:, None] * towards
         if len(xyz) < NEIGHBOURS:
             return xyz[:0], pairs[:0]
         around = correlation[cKDTree(xyz).query(xyz, k=NEIGHBOURS)[1]].mean(axis=1)
         kept = (correlation >= AGREE) & (around >= AGREE_AROUND * np.percentile(around, 75))
         return xyz[kept], pairs[kept]
 
-def _tried(halves: Sequence[_Patches], heights: np.ndarray, tick: Callable[[float], None]) -> np.ndarray | None:
-    """The plane of a grid of tilts and heights along which patches agree most."""
-    slopes = np.tan(np.radians(TILT * np.arange(-TILTS, TILTS + 1)))
-    best, found = 0.0, None
-    for done, (across, down) in enumerate((across, down) for across in slopes for down in slopes):
-        tick(done / len(slopes) ** 2)
-        for height in heights:
-            tilted = np.array([across, down, height])
-            agreement = sum(half.agreement(tilted) for half in halves)
-            if agreement > best:
-                best, found = agreement, tilted
-    return found
 
-
-def _homography(own: Picture, other: Picture, normal: np.ndarray, offset: float) -> np.ndarray:
-    """(3, 3) from pixels (x, y, 1) of a picture to another's, of points on a plane."""
-    turn, shift = other.rotation.T @ own.rotation, other.rotation.T @ (own.centre - other.centre)
-    height = offset - normal @ own.centre
-    return np.asarray(other.matrix @ (turn + np.outer(shift, own.rotation.T @ normal) / (height or 1e-12)) @ np.linalg.inv(own.matrix))
-
-
-def _rays(picture: Picture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """x, y (H W,) of all pixels, and the directions (H W, 3) that they see."""
+def _rays(picture: Picture, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """x, y (H W,) of all pixels, and the directions (H W, 3) that they see, along axes (3, 3)."""
     y, x = (axis.ravel() for axis in np.indices(picture.detail.shape))
-    towards = np.stack([x, y, np.ones_like(x)], axis=1) @ np.linalg.inv(picture.matrix).T @ picture.rotation.T
+    towards = np.stack([x, y, np.ones_like(x)], axis=1) @ np.linalg.inv(picture.matrix).T @ picture.rotation.T @ axes.T
     return x, y, towards
 
 

@@ -59,21 +59,21 @@ def rays_that_end(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cam
 
 
 def find_supports(
-    cells: Cells, observed: np.ndarray, close: np.ndarray, rays: Rays, cameras: np.ndarray, reach: float, known: Plane | None = None
+    cells: Cells, observed: np.ndarray, close: np.ndarray, rays: Rays, cameras: np.ndarray, reach: float, known: Sequence[Plane] = ()
 ) -> tuple[list[Plane], np.ndarray, np.ndarray]:
     """The planes that support the subject, unit normals towards the cameras and offsets, the cells (M,) on them, and the cells behind one.
 
     A plane supports where it holds many cells, the cameras (C, 3) are on one side of it, and so is most of the rest that the photographs' middles show.
 
-    known  one that photographs or sparse points show to support it: what rays do at its edge, where nothing else keeps fog away, does not refute it
+    known  those that photographs or sparse points show to support it: what rays do at their edges, where nothing else keeps fog away, does not refute them
     """
     tolerance = max(1.5 * cells.side, 0.03 * reach)
     support, hidden = np.zeros(len(observed), bool), np.zeros(len(observed), bool)
     planes: list[Plane] = []
     left = observed.copy()
-    for number in range(MAX_PLANES):
-        is_known = number == 0 and known is not None
-        found = known if is_known else _plane(cells.centres[left], tolerance)
+    for number in range(len(known) + MAX_PLANES):
+        is_known = number < len(known)
+        found = known[number] if is_known else _plane(cells.centres[left], tolerance)
         if found is None or len(planes) == MAX_SUPPORTS:
             break
         normal, offset = found
@@ -148,23 +148,23 @@ def near_points(points: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, np
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """The floor or table that a subject stands on, as far as sparse points show it: a plane within the hull of those on it, seen from above, but for where
-    others are seen through it."""
+    """The floor or table that a subject stands on, or the wall behind it, as far as points show it: a plane within the hull of those on it, seen from where the
+    subject is, but for where others are seen through it. Places on it are of `_places`."""
 
-    normal: np.ndarray  # (3,) upwards
+    normal: np.ndarray  # (3,) towards the subject
     offset: float
-    outline: Delaunay  # of the points on it, x and y
-    holes: np.ndarray  # (H, 2) x, y of points below that are seen through it, and of where
+    outline: Delaunay  # of the places of points on it
+    holes: np.ndarray  # (H, 2) places of points behind that are seen through it, and of where
     around: float = 0.0  # distance from these at which it is not known to be opaque
     solid: np.ndarray | None = None  # (T,) bool, triangles of the outline that are part of it; None: all
 
     def distances(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(R,) along rays (R, 3), to where they meet it from above; infinite where they do not."""
+        """(R,) along rays (R, 3), to where they meet it from before; infinite where they do not."""
         toward = -along(directions, self.normal)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             distance = (along(origins, self.normal) - self.offset) / toward
         meets = np.flatnonzero((toward > GRAZING) & (distance > 0))
-        at = origins[meets, :2] + distance[meets, None] * directions[meets, :2]
+        at = _places(self.normal, origins[meets] + distance[meets, None] * directions[meets])
         triangle = self.outline.find_simplex(at)
         inside = triangle >= 0 if self.solid is None else (triangle >= 0) & self.solid[triangle]
         if len(self.holes) and inside.any():
@@ -188,32 +188,43 @@ def opaque_support(points: np.ndarray, cameras: np.ndarray, origins: np.ndarray,
         on, points = points[height <= FLAT * size], points[height > 2 * FLAT * size]
         if len(on) < MIN_ON_SUPPORT:
             continue
-        area = float(ConvexHull(on[:, :2]).volume)
+        found = _spanned(plane, on)
+        area = float(ConvexHull(found.outline.points).volume)
         if broadest is None or area > broadest[0]:
-            broadest = area, Support(*plane, Delaunay(on[:, :2]), np.zeros((0, 2)))
+            broadest = area, found
     return None if broadest is None else _unless_seen_through(broadest[1], size, origins, directions, lengths)
 
 
 def support_of_patches(
     plane: Plane, patches: np.ndarray, points: np.ndarray, origins: np.ndarray, directions: np.ndarray, lengths: np.ndarray
 ) -> Support | None:
-    """A level plane as far as patches on it (N, 3) reach, under a subject of sparse points (M, 3); None where rays (R, 3) to such points at `lengths` (R,) go
-    on through it.
+    """A plane as far as patches on it (N, 3) reach, of a subject of sparse points (M, 3); None where rays (R, 3) to such points at `lengths` (R,) go on through
+    it.
 
     A wide gap between patches is part of it near the subject alone, and where no such ray goes on through it: a table has an edge.
     """
     try:
-        size, whole = _size(points), Support(*plane, Delaunay(patches[:, :2]), np.zeros((0, 2)))
+        size, whole = _size(points), _spanned(plane, patches)
     except QhullError:  # they lie on a line
         return None
     corners = whole.outline.points[whole.outline.simplices]
     wide = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1) > GAP * size
-    solid = ~wide | (np.linalg.norm(corners.mean(axis=1) - np.median(points[:, :2], axis=0), axis=1) <= UNDER * size)
+    solid = ~wide | (np.linalg.norm(corners.mean(axis=1) - np.median(_places(whole.normal, points), axis=0), axis=1) <= UNDER * size)
     distance = whole.distances(origins, directions)
     goes_on = _that_go_on(distance, lengths, size)
-    crossed = whole.outline.find_simplex(origins[goes_on, :2] + distance[goes_on, None] * directions[goes_on, :2])
+    crossed = whole.outline.find_simplex(_places(whole.normal, origins[goes_on] + distance[goes_on, None] * directions[goes_on]))
     solid[crossed] &= ~wide[crossed]
     return _unless_seen_through(replace(whole, solid=solid), size, origins, directions, lengths)
+
+
+def _spanned(plane: Plane, on: np.ndarray) -> Support:
+    """A plane within the hull of points (N, 3) on it. Raises QhullError where they lie on a line."""
+    return Support(*plane, Delaunay(_places(plane[0], on)), np.zeros((0, 2)))
+
+
+def _places(normal: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(N, 2) where points (N, 3) are along two axes across a normal."""
+    return np.stack([along(points, axis) for axis in _axes_across(normal)], axis=1)
 
 
 def _that_go_on(distance: np.ndarray, lengths: np.ndarray, size: float) -> np.ndarray:
@@ -228,7 +239,7 @@ def _unless_seen_through(support: Support, size: float, origins: np.ndarray, dir
     goes_on = _that_go_on(distance, lengths, size)
     if len(goes_on) > MAX_SEEN_THROUGH * np.isfinite(distance).sum():
         return None
-    ways = [origins[goes_on, :2] + to[goes_on, None] * directions[goes_on, :2] for to in (distance, lengths)]
+    ways = [_places(support.normal, origins[goes_on] + to[goes_on, None] * directions[goes_on]) for to in (distance, lengths)]
     return replace(support, holes=np.concatenate(ways), around=HOLE * size)
 
 

@@ -25,8 +25,8 @@ class SparseDepthRays:
     origins: np.ndarray
     directions: np.ndarray
     distance: np.ndarray  # (A,) float32, to the point
-    on_support: np.ndarray  # (A,) bool, those last: the point is on the plane that the subject stands on, and something may stand before it
-    plane: tuple[np.ndarray, float] | None = None  # of the support: its normal (3,), upwards, and offset
+    on_support: np.ndarray  # (A,) bool, those last: the point is on a plane that supports the subject, and something may stand before it
+    planes: tuple[tuple[np.ndarray, float], ...] = ()  # on which those are: normals (3,), towards the subject, and offsets
 
     def __len__(self) -> int:
         return len(self.distance)

@@ -190,10 +190,10 @@ def cascades_needed(samples: FieldSamples, bounds: np.ndarray, least: int, most:
     return int(np.argmax(np.append(beyond[:-1] <= MAX_BEYOND * max(weight.sum(), 1e-9), True))) + 1
 
 
-def region_of(samples: FieldSamples, pixels: Pixels, s: Scene, poses: Path, known: Plane | None = None) -> Region:
+def region_of(samples: FieldSamples, pixels: Pixels, s: Scene, poses: Path, known: Sequence[Plane] = ()) -> Region:
     """The foreground region; the scene bounds where they were given by hand (poses.crop_box), and where the field says too little.
 
-    known  the plane of the table or floor, where training found it
+    known  planes that support the subject, which training found
     """
     if bounds_are_given(poses):
         return Region(np.asarray(s.bounds, np.float64))

@@ -1,7 +1,7 @@
 """The training data of a scene: pixels with their rays, near and far planes, and sparse depth."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -124,12 +124,14 @@ def begin_sky(m: Model, pixels: Pixels) -> str | None:
     return "what photographs show above the horizon"
 
 
-def sparse_depth_of(folder: Path, s: Scene, seed: int = 0, sweep: Callable[[np.ndarray], SweptPlane | None] = lambda points: None) -> SparseDepthRays | None:
+def sparse_depth_of(
+    folder: Path, s: Scene, seed: int = 0, sweep: Callable[[np.ndarray, bool], Sequence[SweptPlane]] = lambda points, table: ()
+) -> SparseDepthRays | None:
     """Rays to the sparse points that are registered in training images, from the cameras of these and from between each and the nearest of the others that see
     the point, where held-out views may lie and nothing else keeps fog away; None: there are none.
 
     Where the sparse points show what the subject stands on, rays of random pixels to it come with them (`efficientnerf.capture.supports.opaque_support`).
-    Where they do not, `sweep`, which gets those near the scene (N, 3), is asked, and rays to what it finds come with them too.
+    What they do not show `sweep` finds, which gets those near the scene (N, 3), and whether they show a table; rays to it come with them too.
 
     Only points that are observed in `MIN_TRACK` images or more, and only from cameras that they lie before: posed data sets name points behind a camera,
     or in it, too. Where they are observed more than `MOST_OBSERVATIONS` times, `seed` draws the points.
@@ -161,29 +163,32 @@ def sparse_depth_of(folder: Path, s: Scene, seed: int = 0, sweep: Callable[[np.n
     middle, reach = s.bounds.mean(axis=0), NEAR_THE_SCENE * (s.bounds[1] - s.bounds[0]).max() / 2
     near = (np.abs(xyz - middle) <= reach).all(axis=1)
     points, known = xyz[tracked & near], (centres[view], to_point / length[:, None], length)
-    support = opaque_support(points, centres[in_training], *known)
-    if support is None and (plane := sweep(points)) is not None:
+    table = opaque_support(points, centres[in_training], *known)
+    supports = [] if table is None else [table]
+    for plane in sweep(points, table is not None):
         support = support_of_patches((plane.normal, plane.offset), plane.xyz, points, *known)
         if support is not None:
+            supports.append(support)
             offset = np.concatenate([plane.xyz - plane.cameras[:, number] for number in (0, 1)])
             distance = np.linalg.norm(offset, axis=1)
             found = _joined(found, _rays(plane.cameras.transpose(1, 0, 2).reshape(-1, 3), offset / distance[:, None], distance, on_support=False))
-    return found if support is None else _with_support(found, support, scene.views_of(s, "train"), seed)
+    return _with_supports(found, supports, scene.views_of(s, "train"), seed) if supports else found
 
 
-def _with_support(found: SparseDepthRays, support: Support, views: tuple[View, ...], seed: int) -> SparseDepthRays:
-    """With half as many rays of random pixels to the support, as many of each view if it shows so much of it."""
+def _with_supports(found: SparseDepthRays, supports: Sequence[Support], views: tuple[View, ...], seed: int) -> SparseDepthRays:
+    """With half as many rays of random pixels to the supports, as many of each view if it shows so much of them."""
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 7, 0]))
     each = max(1, len(found) // (2 * len(views)))
     parts = []
     for view in views:
         pixels = rng.random((SUPPORT_TRIES * each, 2)) * (view.camera.width, view.camera.height)
         origins, directions = rays(view.camera, pixels)
-        distance = support.distances(origins, directions)
+        distance = np.min([support.distances(origins, directions) for support in supports], axis=0)
         meets = np.flatnonzero(np.isfinite(distance))[:each]
         parts.append((origins[meets], directions[meets], distance[meets]))
     origins, directions, distance = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return replace(_joined(found, _rays(origins, directions, distance, on_support=True)), plane=(support.normal, support.offset))
+    planes = tuple((support.normal, support.offset) for support in supports)
+    return replace(_joined(found, _rays(origins, directions, distance, on_support=True)), planes=planes)
 
 
 def _joined(first: SparseDepthRays, second: SparseDepthRays) -> SparseDepthRays:

@@ -1,6 +1,6 @@
-"""The plane that a subject stands on: as training views show it where sparse points do not, and support.json, by which later stages know it."""
+"""The planes that support a subject: as training views show them where sparse points do not, and support.json, by which later stages know them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -8,7 +8,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from efficientnerf.capture.plane_sweep import SweptPlane, picture_of, swept_plane
+from efficientnerf.capture.plane_sweep import SweptPlane, picture_of, swept_plane, swept_wall, wall_faces
 from efficientnerf.capture.supports import Plane
 from efficientnerf.geometry.orbit import Number, Vector
 from efficientnerf.training.pixels import Pixels
@@ -23,14 +23,19 @@ REMEDY = "Train again."
 MOST_PHOTOGRAPHS = 60  # that are compared: of more, evenly chosen ones
 
 
-def find_plane(s: Scene, pixels: Pixels, views: tuple[View, ...], points: np.ndarray, seed: int, progress: Callable[[float], None]) -> SweptPlane | None:
-    """What `efficientnerf.capture.plane_sweep` finds below a subject of sparse points (N, 3).
+def find_planes(
+    s: Scene, pixels: Pixels, views: tuple[View, ...], points: np.ndarray, table: bool, seed: int, progress: Callable[[float], None]
+) -> list[SweptPlane]:
+    """What `efficientnerf.capture.plane_sweep` finds behind a subject of sparse points (N, 3), and, where its table is not known, below it.
 
     pixels, views  of the scene, whose cameras may be others by now
     progress       gets the share that is done; what it raises stops the search
     """
     trained = [view for view in s.views if view.split == "train"]
     trained = [trained[number] for number in np.linspace(0, len(trained) - 1, min(len(trained), MOST_PHOTOGRAPHS)).round().astype(int)]
+    faces = wall_faces([view.camera for view in trained], points)
+    if table and faces is None:
+        return []
     rows = {view.image: number for number, view in enumerate(views)}
     pictures = []
     for view in trained:
@@ -38,27 +43,32 @@ def find_plane(s: Scene, pixels: Pixels, views: tuple[View, ...], points: np.nda
         image = np.asarray(pixels.images[int(pixels.offsets[row]) : int(pixels.offsets[row + 1])]).reshape(*shape, -1)
         usable = pixels.usable_of(row) & (image[..., 3] > 127 if image.shape[-1] == 4 else True)
         pictures.append(picture_of(cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_RGB2GRAY), usable, view.camera, points))
-    return swept_plane(pictures, points, seed, progress)
+    found = [] if table else [swept_plane(pictures, points, seed, lambda share: progress(share / 2))]
+    found += [] if faces is None else [swept_wall(pictures, points, faces, seed, lambda share: progress((1 + share) / 2))]
+    return [plane for plane in found if plane is not None]
+
+
+class _Plane(msgspec.Struct):
+    normal: Vector  # of unit length, towards the subject
+    offset: Number
 
 
 class _Document(msgspec.Struct):
     format: Literal[1]
-    normal: Vector  # of unit length, towards the cameras
-    offset: Number
+    planes: list[_Plane]
 
 
-def write(plane: Plane | None, path: Path) -> None:
+def write(planes: Sequence[Plane], path: Path) -> None:
     """Write support.json; where there is no plane, remove it."""
-    if plane is None:
-        remove(path)
+    if planes:
+        write_json(path, {"format": FORMAT, "planes": [{"normal": normal.tolist(), "offset": offset} for normal, offset in planes]})
     else:
-        write_json(path, {"format": FORMAT, "normal": plane[0].tolist(), "offset": plane[1]})
+        remove(path)
 
 
-def load(train: Path) -> Plane | None:
-    """The plane that the subject stands on, in the training frame, as the train stage in a folder knew it; None: it knew none. Raises CorruptArtifact."""
+def load(train: Path) -> tuple[Plane, ...]:
+    """The planes that support the subject, in the training frame, as the train stage in a folder knew them. Raises CorruptArtifact."""
     path = TrainOutputs(train).support
     if not path.is_file():
-        return None
-    found = read_document(path, _Document, REMEDY)
-    return np.asarray(found.normal, np.float64), float(found.offset)
+        return ()
+    return tuple((np.asarray(plane.normal, np.float64), float(plane.offset)) for plane in read_document(path, _Document, REMEDY).planes)

@@ -211,7 +211,7 @@ def test_a_known_table_ends_the_region_though_rays_go_on_round_its_middle() -> N
     struck = (points[:, 2] < -0.49) & (np.linalg.norm(points[:, :2], axis=1) > 0.9) & (generator.random(len(points)) < 0.4)
     centres = np.array([one.centre for one in cameras])[views]
     points[struck] = centres[struck] + (points - centres)[struck] * generator.uniform(1.2, 2, (int(struck.sum()), 1))
-    alone, known = (find_subject(points, views, pixels, cameras, known=plane) for plane in (None, (np.array([0.0, 0.0, 1.0]), -0.5)))
+    alone, known = (find_subject(points, views, pixels, cameras, known=planes) for planes in ((), [(np.array([0.0, 0.0, 1.0]), -0.5)]))
     assert alone is not None
     assert known is not None
     assert not alone.planes
@@ -223,7 +223,7 @@ def test_a_known_plane_that_the_field_refutes_changes_nothing(offset: float) -> 
     """The floor is seen below it, or nothing is on it."""
     cameras = ring(30, 2.5, 1.2)
     points, views, pixels = cast(cameras, [ball([0, 0, 0], 0.5), ROOM])
-    found = find_subject(points, views, pixels, cameras, known=(np.array([0.0, 0.0, 1.0]), offset))
+    found = find_subject(points, views, pixels, cameras, known=[(np.array([0.0, 0.0, 1.0]), offset)])
     assert found is not None
     np.testing.assert_array_equal(found.region.bounds, found_in(points, views, pixels, cameras).bounds)
 

@@ -1,14 +1,16 @@
 """Photographs agree along the table that a subject stands on, however faint its grain is, and along nothing else."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from efficientnerf.capture import plane_sweep
-from efficientnerf.capture.plane_sweep import Picture, SweptPlane, picture_of, swept_plane
-from efficientnerf.geometry.cameras import project
+from efficientnerf.capture.plane_sweep import Picture, SweptPlane, picture_of, swept_plane, swept_wall, wall_faces
+from efficientnerf.geometry.cameras import Camera, project
 from tests.efficientnerf.capture.plain_table import LEVEL, NORMAL, cameras, height, photograph, subject
+from tests.poses import looking_at
 
 ALL = cameras()
 
@@ -64,11 +66,52 @@ def test_patches_keep_away_from_the_subject_and_from_what_is_masked(table: list[
 def test_a_patch_correlates_along_the_table_alone(table: list[np.ndarray]) -> None:
     made = pictures(table)[::2]
     stack = plane_sweep._Stack(made)
-    patches = plane_sweep._Patches(stack, plane_sweep._pairs(stack.centres), np.zeros(3), LEVEL, 0.8, np.random.default_rng(0))
+    patches = plane_sweep._Patches(stack, plane_sweep._pairs(stack.centres), np.eye(3), np.zeros(3), LEVEL, 0.8, np.random.default_rng(0))
     slopes = NORMAL[:2] / NORMAL[2]
     assert patches.agreement(np.array([*slopes, LEVEL])) > 0.6
     for away in ([*slopes, LEVEL - 0.1], [*slopes, LEVEL + 0.1], [0.2, -0.2, LEVEL]):
         assert patches.agreement(np.array(away)) < 0.2
+
+
+# The table stood up on its edge: its normal along -y, before it cameras in an arc.
+UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+WALL = np.array([np.cos(0.35), np.sin(0.35), 0, -np.sin(0.35), np.cos(0.35), 0, 0, 0, 1]).reshape(3, 3) @ UPRIGHT
+
+
+def before_the_wall(turn: np.ndarray, step: int = 1) -> tuple[list[Picture], list[Camera], np.ndarray]:
+    """Pictures of every so many cameras of the table's, their cameras, and the subject, all of them turned."""
+    chosen = ALL[::step]
+    images = [photograph(camera) for camera in chosen]
+    turned = []
+    for camera in chosen:
+        pose = camera.world_from_camera.copy()
+        pose[:3] = turn @ pose[:3]
+        turned.append(replace(camera, world_from_camera=pose))
+    points = subject() @ turn.T
+    return [picture_of(image, np.full(image.shape, True), camera, points) for image, camera in zip(images, turned, strict=True)], turned, points
+
+
+def test_a_wall_behind_the_subject_is_found_whichever_way_it_faces() -> None:
+    made, turned, points = before_the_wall(WALL)
+    faces = wall_faces(turned, points)
+    assert faces is not None
+    true = WALL @ NORMAL / np.linalg.norm(NORMAL)
+    assert true @ [np.cos(faces), np.sin(faces), 0] > 0.9
+    for off in (0.0, 0.7, -0.7):  # it faces elsewhere than the photographs are taken from
+        plane = swept_wall(made, points, faces + off, 0)
+        assert plane is not None
+        assert plane.normal @ true > np.cos(np.radians(1))
+        np.testing.assert_allclose(plane.offset, LEVEL / np.linalg.norm(NORMAL), atol=0.01)
+        assert np.abs(plane.xyz @ true - plane.offset).max() < 0.03
+    assert swept_plane(made, points, 0) is None, "nothing is below"
+
+
+def test_no_wall_is_behind_what_is_photographed_from_all_round_or_above() -> None:
+    assert wall_faces(ALL, subject()) is None
+    assert wall_faces(ALL[:2], subject()) is None
+    _, above, points = before_the_wall(np.eye(3))
+    steep = [replace(camera, world_from_camera=looking_at((0.5, 0.3 * number, 4), (0, 0, 0))) for number, camera in enumerate(above[:6])]
+    assert wall_faces(steep, points) is None
 
 
 @pytest.mark.parametrize("case", ["each photograph shows another pattern", "half of them show another height", "no grain"])

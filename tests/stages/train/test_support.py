@@ -17,7 +17,7 @@ from stages.io.scene import Scene, View
 from stages.train import run as train
 from stages.train import support
 from stages.train.data import pixels_of, sparse_depth_of
-from stages.train.support import find_plane
+from stages.train.support import find_planes
 from tests.efficientnerf.balls import settings
 from tests.efficientnerf.capture.plain_table import LEVEL, NORMAL, cameras, height, photograph, subject
 from tests.stages.balls import ORBIT, SIMILARITY, job
@@ -50,9 +50,10 @@ def test_rays_end_on_the_table(tmp_path: Path) -> None:
     assert not alone.on_support.any()
     asked: list[np.ndarray] = []
 
-    def found(points: np.ndarray) -> SweptPlane | None:
+    def found(points: np.ndarray, table: bool) -> list[SweptPlane]:
+        assert not table
         asked.append(points)
-        return find_plane(s, pixels, views, points, 0, lambda share: None)
+        return find_planes(s, pixels, views, points, table, 0, lambda share: None)
 
     with_table = sparse_depth_of(tmp_path, s, sweep=found)
     assert with_table is not None
@@ -72,12 +73,12 @@ def test_rays_end_on_the_table(tmp_path: Path) -> None:
 def test_a_table_that_points_are_seen_through_is_none(tmp_path: Path) -> None:
     plane = SweptPlane(NORMAL / np.linalg.norm(NORMAL), LEVEL / float(np.linalg.norm(NORMAL)), *patches_on_the_table())
     s, _, _ = made(tmp_path / "solid")
-    solid = sparse_depth_of(tmp_path / "solid", s, sweep=lambda points: plane)
+    solid = sparse_depth_of(tmp_path / "solid", s, sweep=lambda points, table: [plane])
     assert solid is not None
     assert solid.on_support.any()
     seen_through = np.concatenate([subject()[:20], np.repeat(BELOW, 20, axis=0)])
     s, _, _ = made(tmp_path / "open", seen_through)
-    alone, still = sparse_depth_of(tmp_path / "open", s), sparse_depth_of(tmp_path / "open", s, sweep=lambda points: plane)
+    alone, still = sparse_depth_of(tmp_path / "open", s), sparse_depth_of(tmp_path / "open", s, sweep=lambda points, table: [plane])
     assert alone is not None
     assert still is not None
     np.testing.assert_array_equal(still.distance, alone.distance)
@@ -92,24 +93,27 @@ def patches_on_the_table() -> tuple[np.ndarray, np.ndarray]:
 
 def test_points_on_the_table_are_believed_without_asking_photographs(tmp_path: Path) -> None:
     at = np.random.default_rng(0).uniform(-0.7, 0.7, (200, 2))
-    s, _, _ = made(tmp_path, np.concatenate([subject(), np.column_stack([at, LEVEL - (at @ NORMAL[:2]) / NORMAL[2]])]))
+    s, pixels, views = made(tmp_path, np.concatenate([subject(), np.column_stack([at, LEVEL - (at @ NORMAL[:2]) / NORMAL[2]])]))
 
-    def refused(points: np.ndarray) -> SweptPlane | None:
-        pytest.fail("photographs are compared")
+    asked: list[bool] = []
 
-    found = sparse_depth_of(tmp_path, s, sweep=refused)
+    def sweep(points: np.ndarray, table: bool) -> list[SweptPlane]:
+        asked.append(table)
+        return find_planes(s, pixels, views, points, table, 0, lambda share: pytest.fail("photographs are compared"))
+
+    found = sparse_depth_of(tmp_path, s, sweep=sweep)
     assert found is not None
     assert found.on_support.any()
+    assert asked == [True]
 
 
 def test_views_that_are_left_out_and_those_beyond_the_most_are_not_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     s, pixels, views = made(tmp_path)
     fewer = replace(s, views=tuple(replace(view, split="") if number == 3 else view for number, view in enumerate(s.views)))
-    plane = find_plane(fewer, pixels, views, subject(), 0, lambda share: None)
-    assert plane is not None
+    (plane,) = find_planes(fewer, pixels, views, subject(), False, 0, lambda share: None)
     assert not (plane.cameras == s.views[3].camera.centre).all(axis=-1).any()
     monkeypatch.setattr(support, "MOST_PHOTOGRAPHS", 2)
-    assert find_plane(s, pixels, views, subject(), 0, lambda share: None) is None, "two are too few"
+    assert not find_planes(s, pixels, views, subject(), False, 0, lambda share: None), "two are too few"
 
 
 @pytest.mark.parametrize("weight", [0.1, 0.0])
@@ -118,16 +122,15 @@ def test_training_reports_the_plane_and_asks_for_it_where_it_counts(tmp_path: Pa
     events: list[dict[str, Any]] = []
     few = settings(iterations=3, sample_batch_size=1024, occupancy_warmup_steps=2, preview_every=5, sparse_depth_loss_weight=weight)
     train.run(job(tmp_path, few, poses=tmp_path / "poses", events=events))
-    assert any("the subject stands on a plane" in str(event.get("text")) for event in events) == (weight > 0)
-    plane = support.load(tmp_path / "out")
-    assert (plane is not None) == (weight > 0), "later stages know it too"
-    if plane is not None:
-        length = np.linalg.norm(NORMAL)
-        np.testing.assert_allclose(plane[0], NORMAL / length, atol=0.02)
-        assert plane[1] == pytest.approx(LEVEL / length, abs=0.02)
+    assert any("a plane supports the subject" in str(event.get("text")) for event in events) == (weight > 0)
+    planes, length = support.load(tmp_path / "out"), np.linalg.norm(NORMAL)
+    assert len(planes) == (weight > 0), "later stages know it too"
+    for normal, offset in planes:
+        np.testing.assert_allclose(normal, NORMAL / length, atol=0.02)
+        assert offset == pytest.approx(LEVEL / length, abs=0.02)
 
 
-@pytest.mark.parametrize("text", ["{", '{"format": 2, "normal": [0, 0, 1], "offset": 0}', '{"format": 1, "normal": [0, 0], "offset": 0}'])
+@pytest.mark.parametrize("text", ["{", '{"format": 2, "planes": []}', '{"format": 1, "planes": [{"normal": [0, 0], "offset": 0}]}'])
 def test_a_damaged_plane_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "support.json").write_text(text)
     with pytest.raises(CorruptArtifact):
