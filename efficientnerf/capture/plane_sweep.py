@@ -27,7 +27,7 @@ AROUND = 2.0  # sizes of the subject, within which patches are
 NEAR_POINTS = 0.04  # of a picture's width: how far sparse points are from a patch
 TILTS, TILT = 2, 4.0  # planes that are tried to either side of one, along x and y, and degrees from one to the next
 TURNS, TURN = 10, 6.0  # directions that a wall may face, to either side of where the photographs are taken from, and degrees from one to the next
-ALL_ROUND, FROM_ABOVE = 90.0, 0.5  # degrees without cameras, from which a wall is looked for; horizontal part of the mean view direction, at least
+ALL_ROUND, STEEP = 90.0, 60.0  # degrees round the subject without cameras, from which on a wall is looked for; the mean view direction's from level, at most
 BELOW, BEHIND, STEP = 0.3, 0.9, 0.03  # of the subject's size: how far below it, and behind it, planes are tried, and how far apart
 LOWEST = 1.0  # per cent of the sparse points that may be below what is tried
 TRIES = 60  # evaluations of a local search
@@ -115,7 +115,8 @@ def wall_faces(cameras: Sequence[Camera], points: np.ndarray) -> float | None:
     back = -np.mean([camera.forward for camera in cameras], axis=0)
     azimuth = np.sort(np.arctan2(*(np.array([camera.centre for camera in cameras]) - np.median(points, axis=0))[:, 1::-1].T))
     gap = float(np.degrees(np.diff(np.append(azimuth, azimuth[0] + 2 * np.pi)).max()))
-    return float(np.arctan2(back[1], back[0])) if np.hypot(*back[:2]) >= FROM_ABOVE and gap >= ALL_ROUND else None
+    steep = float(np.degrees(np.arctan2(abs(back[2]), np.hypot(*back[:2]))))
+    return float(np.arctan2(back[1], back[0])) if steep <= STEEP and gap >= ALL_ROUND else None
 
 
 def swept_wall(
