@@ -9,7 +9,7 @@ P points, M cells, C cameras.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -18,7 +18,7 @@ from efficientnerf.asset.region import inside_distance
 from efficientnerf.asset.tree import Region
 from efficientnerf.capture.cells import CENTRAL, CONNECTED, Cells, connected_parts, observed_cells
 from efficientnerf.capture.coverage import meeting_point
-from efficientnerf.capture.supports import Plane, find_supports, rays_that_end, with_feet
+from efficientnerf.capture.supports import LEVEL, Plane, find_supports, rays_that_end, with_feet
 from efficientnerf.geometry.cameras import Camera
 
 MIN_POINTS = 200
@@ -113,6 +113,7 @@ def find_subject(
         region = _region_of(found, cells.side, level=round_it, margin=WIDE_MARGIN)
     else:
         region = _region_of(found, cells.side, cells.centres[support & close], level=level)
+        region = _ended_below([plane for plane in known if any(_same(plane, one) for one in planes)], region)
     return Foreground(region, cells.side, found, tuple(planes))
 
 
@@ -176,6 +177,21 @@ def _ending_in_view(cells: Cells, adjacent: np.ndarray, subject: np.ndarray, oth
                 whole &= bool(ends[part == number][last].mean() >= MIN_ENDING)
         out[mine] = whole
     return out
+
+
+def _same(one: Plane, other: Plane) -> bool:
+    return one[1] == other[1] and bool((one[0] == other[0]).all())
+
+
+def _ended_below(planes: Sequence[Plane], region: Region) -> Region:
+    """The region without what is far below a level plane that is known: in the cells its place is known to a few of their sides alone."""
+    bounds = region.bounds.copy()
+    size = float((bounds[1] - bounds[0]).max())
+    for normal, offset in planes:
+        if normal[2] > LEVEL:
+            lowest = (offset - np.maximum(normal[:2] * bounds[0, :2], normal[:2] * bounds[1, :2]).sum()) / normal[2]  # of its four corners
+            bounds[0, 2] = max(bounds[0, 2], lowest - MARGIN * size)
+    return replace(region, bounds=bounds)
 
 
 def _volume(points: np.ndarray) -> float:

@@ -216,6 +216,8 @@ def test_a_known_table_ends_the_region_though_rays_go_on_round_its_middle() -> N
     assert known is not None
     assert not alone.planes
     assert np.abs(known.region.bounds - clean.bounds).max() < 0.25
+    below = -0.5 - known.region.bounds[0, 2]
+    assert clean.fade < below < 0.15, "its depth is known better than to a cell"
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.4, -3.0])
