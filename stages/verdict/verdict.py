@@ -288,7 +288,9 @@ def _of_gps(capture: Capture) -> list[Problem]:
     if gps is None or gps.used != "nothing":
         return []
     words = f"{gps.photographs} of {len(capture.photos)} photographs {plural(gps.photographs, 'have', 'has')} a GPS position"
-    if gps.distance is not None:
+    if gps.distance is not None and not gps.extent:
+        words += ", all of them the same one, and not used."
+    elif gps.distance is not None:
         words += f", {gps.distance:.2g} m from the cameras found in the median: too far for an extent of {gps.extent:.2g} m, and not used."
     else:
         words += ": too few to be used."

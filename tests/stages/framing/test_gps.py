@@ -117,7 +117,7 @@ def test_exact_positions_give_metres_and_the_upward_axis(tmp_path: Path) -> None
         assert photo.camera.params == before.camera.params
 
 
-@pytest.mark.parametrize(("extent", "noise", "known"), [(0.05, 4.0, 99), (1.0, 0.1, 11)])
+@pytest.mark.parametrize(("extent", "noise", "known"), [(0.05, 4.0, 99), (1.0, 0.1, 11), (0.0, 0.0, 99)])
 def test_positions_that_say_nothing_change_nothing(tmp_path: Path, extent: float, noise: float, known: int) -> None:
     given, files, _ = capture(tmp_path, CIRCLE, 0.0, np.random.default_rng(5), known)
     rng = np.random.default_rng(6)
@@ -132,6 +132,7 @@ def test_positions_that_say_nothing_change_nothing(tmp_path: Path, extent: float
     assert sentence == "", "the terminal need not have it"
     (problem,) = (each for each in verdict_on(found, {}).problems if each.what == "gps")
     assert problem.grade == "good"
+    assert ("all of them the same one" in problem.sentence) == (noise == 0)
     np.testing.assert_array_equal(lengths(found), lengths(given))
 
 
