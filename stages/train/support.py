@@ -1,5 +1,6 @@
 """The planes that support a subject: as training views show them where sparse points do not, and support.json, by which later stages know them."""
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
@@ -51,6 +52,10 @@ def find_planes(
 class _Plane(msgspec.Struct):
     normal: Vector  # of unit length, towards the subject
     offset: Number
+
+    def __post_init__(self) -> None:
+        if not math.isclose(math.hypot(*self.normal), 1, rel_tol=1e-6):
+            raise ValueError("a normal that is not of unit length")
 
 
 class _Document(msgspec.Struct):

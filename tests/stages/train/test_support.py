@@ -130,8 +130,19 @@ def test_training_reports_the_plane_and_asks_for_it_where_it_counts(tmp_path: Pa
         assert offset == pytest.approx(LEVEL / length, abs=0.02)
 
 
-@pytest.mark.parametrize("text", ["{", '{"format": 2, "planes": []}', '{"format": 1, "planes": [{"normal": [0, 0], "offset": 0}]}'])
-def test_a_damaged_plane_is_refused(tmp_path: Path, text: str) -> None:
-    (tmp_path / "support.json").write_text(text)
-    with pytest.raises(CorruptArtifact):
+@pytest.mark.parametrize("planes", ["{", "[0]", '[{"normal": [0, 0], "offset": 0}]', '[{"normal": [0, 0, 0.9], "offset": 0}]', '[{"normal": [0, 0, 1]}]'])
+def test_a_damaged_plane_is_refused(tmp_path: Path, planes: str) -> None:
+    (tmp_path / "support.json").write_text(f'{{"format": 1, "planes": {planes}}}')
+    with pytest.raises(CorruptArtifact, match="support.json"):
         support.load(tmp_path)
+
+
+def test_planes_are_read_as_they_were_written(tmp_path: Path) -> None:
+    planes = [(normal / np.linalg.norm(normal), 0.1) for normal in (NORMAL, np.array([1.0, -0.2, 0.1]))]
+    support.write(planes, tmp_path / "support.json")
+    for (normal, offset), (other, level) in zip(planes, support.load(tmp_path), strict=True):
+        np.testing.assert_array_equal(normal, other)
+        assert offset == level
+    support.write((), tmp_path / "support.json")
+    assert support.load(tmp_path) == ()
+    support.write((), tmp_path / "support.json")
