@@ -133,7 +133,7 @@ def test_training_reports_the_plane_and_asks_for_it_where_it_counts(tmp_path: Pa
 @pytest.mark.parametrize("planes", ["{", "[0]", '[{"normal": [0, 0], "offset": 0}]', '[{"normal": [0, 0, 0.9], "offset": 0}]', '[{"normal": [0, 0, 1]}]'])
 def test_a_damaged_plane_is_refused(tmp_path: Path, planes: str) -> None:
     (tmp_path / "support.json").write_text(f'{{"format": 1, "planes": {planes}}}')
-    with pytest.raises(CorruptArtifact, match="support.json"):
+    with pytest.raises(CorruptArtifact):
         support.load(tmp_path)
 
 
