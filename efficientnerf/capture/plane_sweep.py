@@ -23,7 +23,7 @@ LEAST_DETAIL = 0.6  # deviation of a patch, of 255
 SIDE = 9  # pixels along a patch
 NARROW, WIDE, BEST = 5.0, 35.0, 15.0  # degrees between two cameras of a pair, round the subject
 PAIRS, PATCHES, FITTED, TRIED = 2, 96, 24, 6  # pairs of a photograph; patches of a pair: of all, to fit a plane, and while many are tried
-AROUND = 2.0  # sizes of the subject, within which patches are
+AROUND, FARTHER, MORE = 2.0, 6.0, 3  # sizes of the subject, within which patches are; of a plane that is known, and how many times as many
 NEAR_POINTS = 0.04  # of a picture's width: how far sparse points are from a patch
 TILTS, TILT = 2, 4.0  # planes that are tried to either side of one, along x and y, and degrees from one to the next
 TURNS, TURN = 10, 6.0  # directions that a wall may face, to either side of where the photographs are taken from, and degrees from one to the next
@@ -164,7 +164,7 @@ def _sweep(pictures: Sequence[Picture], points: np.ndarray, axes: np.ndarray, be
         return None
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 10, 0]))
     stack, lowest = _Stack(pictures), _lowest(near, axes)
-    halves = [_Patches(stack, begin + 2 * _pairs(centres[begin::2] - middle), axes, middle, lowest, size, rng) for begin in (0, 1)]
+    halves = [_Patches(stack, begin + 2 * _pairs(centres[begin::2] - middle), axes, middle, size, rng).chosen(lowest, AROUND, PATCHES) for begin in (0, 1)]
     return _Sweep(axes, halves, near, middle, size, below) if min(len(half.pair) for half in halves) >= FEWEST else None
 
 
@@ -192,7 +192,7 @@ def _agreed(sweep: _Sweep, tried: Sequence[tuple[np.ndarray, np.ndarray]], tick:
     (normal, offset), centres = halves[0].plane(plane), halves[0].stack.centres
     if np.median(along(sweep.near, normal)) < offset or (along(centres, normal) > offset).mean() < 0.8:
         return None
-    on = [half.on(plane) for half in halves]
+    on = [half.chosen(plane[2], FARTHER, MORE * PATCHES).on(plane) for half in halves]
     xyz, shown = np.concatenate([at for at, _ in on]), np.concatenate([numbers for _, numbers in on])
     return SweptPlane(normal, offset, xyz, centres[shown]) if len(xyz) >= FEWEST else None
 
@@ -223,18 +223,14 @@ class _Stack:
 class _Patches:
     """Patches of the first photographs of pairs, to be found in the second ones."""
 
-    def __init__(
-        self, stack: _Stack, pairs: np.ndarray, axes: np.ndarray, middle: np.ndarray, lowest: float, size: float, rng: np.random.Generator
-    ) -> None:
-        self.stack, self.pairs, self.axes, self.middle, self.size = stack, pairs, axes, middle, size
-        chosen = [self._chosen(stack.pictures[first], lowest, rng) for first, _ in pairs]
-        self.pair = np.repeat(np.arange(len(pairs)), [len(each) for each in chosen])
-        self.at = np.concatenate(chosen) if chosen else np.zeros((0, 2), int)  # (P, 2) x, y
+    pair: np.ndarray  # (P,) to which pair each belongs
+    at: np.ndarray  # (P, 2) x, y
+    own: np.ndarray  # (P, S) what the first photograph shows of each
+
+    def __init__(self, stack: _Stack, pairs: np.ndarray, axes: np.ndarray, middle: np.ndarray, size: float, rng: np.random.Generator) -> None:
+        self.stack, self.pairs, self.axes, self.middle, self.size, self.rng = stack, pairs, axes, middle, size, rng
         side = np.arange(SIDE) - SIDE // 2
         self.window = np.stack([*np.meshgrid(side, side), np.zeros((SIDE, SIDE))], axis=-1).reshape(-1, 3)
-        x, y = (self.at[:, None] + self.window[:, :2].astype(int)).transpose(2, 0, 1)
-        own = pairs[self.pair, 0][:, None]
-        self.own = _normalised(stack.detail[stack.begin[own] + y * stack.width[own] + x])
         first, second = pairs.T
         back, turned = np.linalg.inv(stack.matrix[first]), stack.matrix[second] @ stack.rotation[second].transpose(0, 2, 1)
         # of the homographies from each first photograph to its second one: without a plane, and what a plane adds (see `correlations`)
@@ -253,18 +249,29 @@ class _Patches:
         part.axes = axes
         return part
 
-    def _chosen(self, picture: Picture, lowest: float, rng: np.random.Generator) -> np.ndarray:
-        """(P, 2) pixels with detail that see the surroundings of the subject, at the height of its lowest points."""
+    def chosen(self, height: float, around: float, each: int) -> "_Patches":
+        """With `each` random patches of each pair, that see what is at a height along the last axis, within so many sizes of the subject."""
+        part, stack = copy(self), self.stack
+        chosen = [self._pixels(stack.pictures[first], height, around, each) for first, _ in self.pairs]
+        part.pair = np.repeat(np.arange(len(chosen)), [len(pixels) for pixels in chosen])
+        part.at = np.concatenate(chosen) if chosen else np.zeros((0, 2), int)
+        x, y = (part.at[:, None] + self.window[:, :2].astype(int)).transpose(2, 0, 1)
+        own = self.pairs[part.pair, 0][:, None]
+        part.own = _normalised(stack.detail[stack.begin[own] + y * stack.width[own] + x])
+        return part
+
+    def _pixels(self, picture: Picture, height: float, around: float, each: int) -> np.ndarray:
+        """(P, 2) pixels with detail of a photograph, for `chosen`."""
         x, y, towards = _rays(picture, self.axes)
         centre = self.axes @ picture.centre
         with np.errstate(divide="ignore", invalid="ignore"):
-            distance = (lowest - centre[2]) / towards[:, 2]
+            distance = (height - centre[2]) / towards[:, 2]
             at = centre + distance[:, None] * towards
         with np.errstate(invalid="ignore", over="ignore"):
-            around = (distance > 0) & (np.hypot(*(at[:, :2] - self.axes[:2] @ self.middle).T) <= AROUND * self.size)
+            near = (distance > 0) & (np.hypot(*(at[:, :2] - self.axes[:2] @ self.middle).T) <= around * self.size)
         square = cv2.boxFilter(picture.detail**2, -1, (SIDE, SIDE)) - cv2.boxFilter(picture.detail, -1, (SIDE, SIDE)) ** 2
-        pixels = np.flatnonzero(around & (picture.clear & (square > LEAST_DETAIL**2)).ravel())
-        pixels = rng.choice(pixels, min(len(pixels), PATCHES), replace=False)
+        pixels = np.flatnonzero(near & (picture.clear & (square > LEAST_DETAIL**2)).ravel())
+        pixels = self.rng.choice(pixels, min(len(pixels), each), replace=False)
         return np.stack([x[pixels], y[pixels]], axis=1)
 
     def fewer(self, each: int, apart: int = 1) -> "_Patches":
@@ -324,8 +331,12 @@ class _Patches:
         xyz = centres + ((offset - along(centres, normal)) / along(towards, normal))[:, None] * towards
         if len(xyz) < NEIGHBOURS:
             return xyz[:0], pairs[:0]
-        around = correlation[cKDTree(xyz).query(xyz, k=NEIGHBOURS)[1]].mean(axis=1)
+        neighbours = cKDTree(xyz).query(xyz, k=NEIGHBOURS)[1]
+        around = correlation[neighbours].mean(axis=1)
         kept = (correlation >= AGREE) & (around >= AGREE_AROUND * np.percentile(around, 75))
+        for away in (-APART * self.size, APART * self.size):
+            elsewhere = np.nan_to_num(self.correlations(np.array([*tilted[:2], tilted[2] + away]))[seen])
+            kept &= elsewhere[neighbours].mean(axis=1) <= LESS * around
         return xyz[kept], pairs[kept]
 
 

@@ -198,15 +198,17 @@ def opaque_support(points: np.ndarray, cameras: np.ndarray, origins: np.ndarray,
 def support_of_patches(
     plane: Plane, patches: np.ndarray, points: np.ndarray, origins: np.ndarray, directions: np.ndarray, lengths: np.ndarray
 ) -> Support | None:
-    """A plane as far as patches on it (N, 3) reach, of a subject of sparse points (M, 3); None where rays (R, 3) to such points at `lengths` (R,) go on through
-    it.
+    """A plane as far as patches (N, 3) and sparse points on it reach, of a subject of sparse points (M, 3); None where rays (R, 3) to such points at `lengths`
+    (R,) go on through it.
 
     A wide gap between patches is part of it near the subject alone, and where no such ray goes on through it: a table has an edge.
     """
     try:
-        size, whole = _size(points), _spanned(plane, patches)
+        _spanned(plane, patches)
     except QhullError:  # they lie on a line
         return None
+    size = _size(points)
+    whole = _spanned(plane, np.concatenate([patches, points[np.abs(along(points, plane[0]) - plane[1]) <= FLAT * size]]))
     corners = whole.outline.points[whole.outline.simplices]
     wide = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1) > GAP * size
     solid = ~wide | (np.linalg.norm(corners.mean(axis=1) - np.median(_places(whole.normal, points), axis=0), axis=1) <= UNDER * size)

@@ -66,7 +66,7 @@ def test_patches_keep_away_from_the_subject_and_from_what_is_masked(table: list[
 def test_a_patch_correlates_along_the_table_alone(table: list[np.ndarray]) -> None:
     made = pictures(table)[::2]
     stack = plane_sweep._Stack(made)
-    patches = plane_sweep._Patches(stack, plane_sweep._pairs(stack.centres), np.eye(3), np.zeros(3), LEVEL, 0.8, np.random.default_rng(0))
+    patches = plane_sweep._Patches(stack, plane_sweep._pairs(stack.centres), np.eye(3), np.zeros(3), 0.8, np.random.default_rng(0)).chosen(LEVEL, 2.0, 96)
     slopes = NORMAL[:2] / NORMAL[2]
     assert patches.agreement(np.array([*slopes, LEVEL])) > 0.6
     for away in ([*slopes, LEVEL - 0.1], [*slopes, LEVEL + 0.1], [0.2, -0.2, LEVEL]):
