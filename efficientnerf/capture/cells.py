@@ -38,9 +38,11 @@ class Cells:
         return (self.agree >= np.minimum(3, np.maximum(1, self.in_view))) & (self.agree >= self.against)
 
 
-def observed_cells(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera], side: float) -> Cells:
-    """The cells, of about this side or larger, in which rays end."""
-    ends = np.flatnonzero(np.isfinite(points).all(axis=1))
+def observed_cells(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera], side: float, farthest: float) -> Cells:
+    """The cells, of about this side or larger, in which rays end that are no longer than `farthest`: what lies far away makes none larger."""
+    centres = np.array([camera.centre for camera in cameras])
+    with np.errstate(invalid="ignore"):
+        ends = np.flatnonzero(np.linalg.norm(points - centres[views], axis=1) <= farthest)
     while True:
         index = np.floor(points[ends] / side)
         index = index[(np.abs(index) < 2**20).all(axis=1)]

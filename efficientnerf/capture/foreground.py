@@ -27,7 +27,7 @@ MAX_CAMERAS = 64  # evenly spaced over the capture
 CELLS_TO_FOCUS = 40  # along the distance from the cameras to what they look at
 NEAR_QUANTILE = 0.35  # of a view's central distances: its subject, behind which there is always something
 OBSERVED, REACHED = 0.6, 0.05  # views of a cell over those of the cells with most: what is well observed; what the subject may still reach into
-FARTHEST, PATH_FARTHEST = 1.6, 3.0  # distance of a cell from its views over the usual distance
+FARTHEST, PATH_FARTHEST, LONGER = 1.6, 3.0, 1.2  # distance of a cell from its views over the usual distance, and of what is put into cells over that
 # docs/experiments/foreground.md
 MIN_SHARE, MIN_PART = 0.2, 0.02  # of the central rays: that a subject holds at least; that a connected part of it does
 MARGIN, WIDE_MARGIN, SUPPORT_MARGIN, FADE = 0.06, 0.1, 0.25, 0.02  # of the longest side
@@ -82,7 +82,7 @@ def find_subject(
     if ends.sum() < MIN_POINTS:
         return None
     focus, reach, converging = find_focus(points, views, pixels, cameras)
-    cells = observed_cells(points, views, pixels, cameras, reach / CELLS_TO_FOCUS)
+    cells = observed_cells(points, views, pixels, cameras, reach / CELLS_TO_FOCUS, LONGER * (FARTHEST if converging else PATH_FARTHEST) * reach)
     trusted = cells.trusted
     if trusted.sum() < 10:
         return None

@@ -246,6 +246,21 @@ def test_floaters_before_the_cameras_and_scattered_ends_change_little() -> None:
     assert np.abs(noisy.bounds - clean.bounds).max() < 0.25
 
 
+def test_what_is_scattered_far_away_makes_no_cell_larger() -> None:
+    """As in a large room: each of a hundred thousand rays ends somewhere else."""
+    cameras = ring(48, 2.5, 1.2)
+    points, views, pixels = cast(cameras, [ball([0, 0, 0], 0.5), box([-60, -60, -0.5], [60, 60, 40], from_within=True)])
+    clean = find_subject(points, views, pixels, cameras)
+    centres = np.array([one.centre for one in cameras])[views]
+    far = np.linalg.norm(points - centres, axis=1) > 8
+    points[far] = centres[far] + (points - centres)[far] * np.random.default_rng(1).uniform(1, 20, (int(far.sum()), 1))
+    found = find_subject(points, views, pixels, cameras)
+    assert found is not None
+    assert clean is not None
+    assert found.side == clean.side
+    np.testing.assert_array_equal(found.region.bounds, clean.region.bounds)
+
+
 def test_a_subject_seen_from_one_side_is_whole() -> None:
     cameras = ring(16, 2.2, 0.6, arc=90)
     found = region(cameras, [box([-0.4, -0.4, -0.5], [0.4, 0.4, 0.7]), ROOM])
