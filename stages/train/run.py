@@ -105,16 +105,16 @@ def trained(job: Job) -> bool:
 def sparse_depth(job: Job, folder: Path, s: Scene, m: Model, pixels: Pixels, views: tuple[View, ...]) -> SparseDepthRays | None:
     """Rays to sparse points. A message says where there are points and none can be used."""
     settings, searched = m.settings, partial(job.reached, total=1.0, text="searching for the planes of table and wall")
+    used = settings.sparse_depth_loss_weight > 0 and m.space.unbounded
 
     def sweep(points: np.ndarray, table: bool) -> list[SweptPlane]:
-        used = settings.sparse_depth_loss_weight > 0 and m.space.unbounded
         return support.find_planes(s, pixels, views, points, table, settings.seed, searched) if used else []
 
     found = sparse_depth_of(folder, s, settings.seed, sweep)
     if found is None and s.points and settings.sparse_depth_loss_weight > 0:
         job.say("no sparse point is in front of enough of the training cameras that observe it; train.sparse_depth_loss_weight has no effect")
     support.write(() if found is None else found.planes, job.work / TrainOutputs.support)
-    if found is not None and found.on_support.any():
+    if used and found is not None and found.on_support.any():
         what = "a plane supports" if len(found.planes) == 1 else f"{len(found.planes)} planes support"
         job.say(f"{what} the subject, where rays end: {int(found.on_support.sum())} rays are trained on")
     return found
