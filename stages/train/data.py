@@ -125,13 +125,13 @@ def begin_sky(m: Model, pixels: Pixels) -> str | None:
 
 
 def sparse_depth_of(
-    folder: Path, s: Scene, seed: int = 0, sweep: Callable[[np.ndarray, bool], Sequence[SweptPlane]] = lambda points, table: ()
+    folder: Path, s: Scene, seed: int = 0, sweep: Callable[[np.ndarray], Sequence[SweptPlane]] = lambda points: ()
 ) -> SparseDepthRays | None:
     """Rays to the sparse points that are registered in training images, from the cameras of these and from between each and the nearest of the others that see
     the point, where held-out views may lie and nothing else keeps fog away; None: there are none.
 
     Where the sparse points show what the subject stands on, rays of random pixels to it come with them (`efficientnerf.capture.supports.opaque_support`).
-    What they do not show `sweep` finds, which gets those near the scene (N, 3), and whether they show a table; rays to it come with them too.
+    So do rays to what `sweep` finds, which gets those near the scene (N, 3): a table has features here and none there.
 
     Only points that are observed in `MIN_TRACK` images or more, and only from cameras that they lie before: posed data sets name points behind a camera,
     or in it, too. Where they are observed more than `MOST_OBSERVATIONS` times, `seed` draws the points.
@@ -165,7 +165,7 @@ def sparse_depth_of(
     points, known = xyz[tracked & near], (centres[view], to_point / length[:, None], length)
     table = opaque_support(points, centres[in_training], *known)
     supports = [] if table is None else [table]
-    for plane in sweep(points, table is not None):
+    for plane in sweep(points):
         support = support_of_patches((plane.normal, plane.offset), plane.xyz, points, *known)
         if support is not None:
             supports.append(support)

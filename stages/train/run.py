@@ -107,8 +107,8 @@ def sparse_depth(job: Job, folder: Path, s: Scene, m: Model, pixels: Pixels, vie
     settings, searched = m.settings, partial(job.reached, total=1.0, text="searching for the planes of table and wall")
     used = settings.sparse_depth_loss_weight > 0 and m.space.unbounded
 
-    def sweep(points: np.ndarray, table: bool) -> list[SweptPlane]:
-        return support.find_planes(s, pixels, views, points, table, settings.seed, searched) if used else []
+    def sweep(points: np.ndarray) -> list[SweptPlane]:
+        return support.find_planes(s, pixels, views, points, settings.seed, searched) if used else []
 
     found = sparse_depth_of(folder, s, settings.seed, sweep)
     if found is None and s.points and settings.sparse_depth_loss_weight > 0:

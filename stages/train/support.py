@@ -1,4 +1,4 @@
-"""The planes that support a subject: as training views show them where sparse points do not, and support.json, by which later stages know them."""
+"""The planes that support a subject: as training views show them, and support.json, by which later stages know them."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -25,18 +25,15 @@ MOST_PHOTOGRAPHS = 60  # that are compared: of more, evenly chosen ones
 
 
 def find_planes(
-    s: Scene, pixels: Pixels, views: tuple[View, ...], points: np.ndarray, table: bool, seed: int, progress: Callable[[float], None]
+    s: Scene, pixels: Pixels, views: tuple[View, ...], points: np.ndarray, seed: int, progress: Callable[[float], None]
 ) -> list[SweptPlane]:
-    """What `efficientnerf.capture.plane_sweep` finds behind a subject of sparse points (N, 3), and, where its table is not known, below it.
+    """What `efficientnerf.capture.plane_sweep` finds below and behind a subject of sparse points (N, 3).
 
     pixels, views  of the scene, whose cameras may be others by now
     progress       gets the share that is done; what it raises stops the search
     """
     trained = [view for view in s.views if view.split == "train"]
     trained = [trained[number] for number in np.linspace(0, len(trained) - 1, min(len(trained), MOST_PHOTOGRAPHS)).round().astype(int)]
-    faces = wall_faces([view.camera for view in trained], points)
-    if table and faces is None:
-        return []
     rows = {view.image: number for number, view in enumerate(views)}
     pictures = []
     for view in trained:
@@ -44,8 +41,9 @@ def find_planes(
         image = np.asarray(pixels.images[int(pixels.offsets[row]) : int(pixels.offsets[row + 1])]).reshape(*shape, -1)
         usable = pixels.usable_of(row) & (image[..., 3] > 127 if image.shape[-1] == 4 else True)
         pictures.append(picture_of(cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_RGB2GRAY), usable, view.camera, points))
-    found = [] if table else [swept_plane(pictures, points, seed, lambda share: progress(share / 2))]
-    found += [] if faces is None else [swept_wall(pictures, points, faces, seed, lambda share: progress((1 + share) / 2))]
+    found = [swept_plane(pictures, points, seed, lambda share: progress(share / 2))]
+    if (faces := wall_faces([view.camera for view in trained], points)) is not None:
+        found.append(swept_wall(pictures, points, faces, seed, lambda share: progress((1 + share) / 2)))
     return [plane for plane in found if plane is not None]
 
 

@@ -50,10 +50,9 @@ def test_rays_end_on_the_table(tmp_path: Path) -> None:
     assert not alone.on_support.any()
     asked: list[np.ndarray] = []
 
-    def found(points: np.ndarray, table: bool) -> list[SweptPlane]:
-        assert not table
+    def found(points: np.ndarray) -> list[SweptPlane]:
         asked.append(points)
-        return find_planes(s, pixels, views, points, table, 0, lambda share: None)
+        return find_planes(s, pixels, views, points, 0, lambda share: None)
 
     with_table = sparse_depth_of(tmp_path, s, sweep=found)
     assert with_table is not None
@@ -73,12 +72,12 @@ def test_rays_end_on_the_table(tmp_path: Path) -> None:
 def test_a_table_that_points_are_seen_through_is_none(tmp_path: Path) -> None:
     plane = SweptPlane(NORMAL / np.linalg.norm(NORMAL), LEVEL / float(np.linalg.norm(NORMAL)), *patches_on_the_table())
     s, _, _ = made(tmp_path / "solid")
-    solid = sparse_depth_of(tmp_path / "solid", s, sweep=lambda points, table: [plane])
+    solid = sparse_depth_of(tmp_path / "solid", s, sweep=lambda points: [plane])
     assert solid is not None
     assert solid.on_support.any()
     seen_through = np.concatenate([subject()[:20], np.repeat(BELOW, 20, axis=0)])
     s, _, _ = made(tmp_path / "open", seen_through)
-    alone, still = sparse_depth_of(tmp_path / "open", s), sparse_depth_of(tmp_path / "open", s, sweep=lambda points, table: [plane])
+    alone, still = sparse_depth_of(tmp_path / "open", s), sparse_depth_of(tmp_path / "open", s, sweep=lambda points: [plane])
     assert alone is not None
     assert still is not None
     np.testing.assert_array_equal(still.distance, alone.distance)
@@ -91,29 +90,29 @@ def patches_on_the_table() -> tuple[np.ndarray, np.ndarray]:
     return np.column_stack([at, LEVEL - (at @ NORMAL[:2]) / NORMAL[2]]), centres[rng.integers(len(centres), size=(200, 2))]
 
 
-def test_points_on_the_table_are_believed_without_asking_photographs(tmp_path: Path) -> None:
-    at = np.random.default_rng(0).uniform(-0.7, 0.7, (200, 2))
+def test_points_on_one_half_of_a_table_and_photographs_of_the_other_show_all_of_it(tmp_path: Path) -> None:
+    """As where half of it is printed with dots."""
+    at = np.random.default_rng(0).uniform((0.3, -0.7), (0.7, 0.7), (100, 2))
     s, pixels, views = made(tmp_path, np.concatenate([subject(), np.column_stack([at, LEVEL - (at @ NORMAL[:2]) / NORMAL[2]])]))
-
-    asked: list[bool] = []
-
-    def sweep(points: np.ndarray, table: bool) -> list[SweptPlane]:
-        asked.append(table)
-        return find_planes(s, pixels, views, points, table, 0, lambda share: pytest.fail("photographs are compared"))
-
-    found = sparse_depth_of(tmp_path, s, sweep=sweep)
-    assert found is not None
-    assert found.on_support.any()
-    assert asked == [True]
+    found = [sparse_depth_of(tmp_path, s), sparse_depth_of(tmp_path, s, sweep=lambda points: find_planes(s, pixels, views, points, 0, lambda share: None))]
+    reached = []
+    for rays in found:
+        assert rays is not None
+        ends = (rays.origins + rays.distance[:, None] * rays.directions)[rays.on_support]
+        assert len(ends)
+        assert np.abs(height(ends)).max() < 0.02
+        reached.append(ends[:, 0].min())
+    assert reached[0] > -0.3, "the feet of the subject lie on it too"
+    assert reached[1] < -0.7
 
 
 def test_views_that_are_left_out_and_those_beyond_the_most_are_not_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     s, pixels, views = made(tmp_path)
     fewer = replace(s, views=tuple(replace(view, split="") if number == 3 else view for number, view in enumerate(s.views)))
-    (plane,) = find_planes(fewer, pixels, views, subject(), False, 0, lambda share: None)
+    (plane,) = find_planes(fewer, pixels, views, subject(), 0, lambda share: None)
     assert not (plane.cameras == s.views[3].camera.centre).all(axis=-1).any()
     monkeypatch.setattr(support, "MOST_PHOTOGRAPHS", 2)
-    assert not find_planes(s, pixels, views, subject(), False, 0, lambda share: None), "two are too few"
+    assert not find_planes(s, pixels, views, subject(), 0, lambda share: None), "two are too few"
 
 
 @pytest.mark.parametrize("weight", [0.1, 0.0])
