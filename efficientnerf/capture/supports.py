@@ -6,10 +6,12 @@ rays pass between and past them, and the head lies next to the plane of the ches
 M cells, R rays, C cameras.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
 from efficientnerf.capture.cells import CONNECTED, Cells, connected_parts
@@ -31,7 +33,8 @@ MAX_POINTS = 4000  # that a level plane is looked for in
 # Of a support that rays do not pass: points on it at least; sine from which rays meet it; of the rays to sparse points that meet it, those that go on, and by
 # how much of the distance; of the extent of the points, round such a ray. docs/experiments/losses.md
 MIN_ON_SUPPORT, GRAZING, MAX_SEEN_THROUGH, SLACK, HOLE = 30, 0.1, 0.05, 0.03, 0.05
-GAP, UNDER = 0.3, 0.75  # of the subject's size: a wide gap between patches; how far from its middle they may be hidden by it
+# Of the subject's size: a wide gap between patches; how far from its middle they may be hidden by it; how large a gap may be that patches enclose
+GAP, UNDER, ENCLOSED = 0.3, 0.75, 2.0
 MAX_FOOT_HEIGHT = 0.3  # of the subject's size, that a part of it stands above a support at most
 
 Plane = tuple[np.ndarray, float]
@@ -201,7 +204,7 @@ def support_of_patches(
     """A plane as far as patches (N, 3) and sparse points on it reach, of a subject of sparse points (M, 3); None where rays (R, 3) to such points at `lengths`
     (R,) go on through it.
 
-    A wide gap between patches is part of it near the subject alone, and where no such ray goes on through it: a table has an edge.
+    A wide gap between patches is part of it near the subject, and where it is enclosed, if no such ray goes on through it: a table has an edge.
     """
     try:
         _spanned(plane, patches)
@@ -216,7 +219,22 @@ def support_of_patches(
     goes_on = _that_go_on(distance, lengths, size)
     crossed = whole.outline.find_simplex(_places(whole.normal, origins[goes_on] + distance[goes_on, None] * directions[goes_on]))
     solid[crossed] &= ~wide[crossed]
+    for gap in _enclosed(whole.outline, wide):
+        solid[gap] |= np.ptp(corners[gap], axis=(0, 1)).max() <= ENCLOSED * size and not np.isin(gap, crossed).any()
     return _unless_seen_through(replace(whole, solid=solid), size, origins, directions, lengths)
+
+
+def _enclosed(outline: Delaunay, wide: np.ndarray) -> Iterator[np.ndarray]:
+    """The triangles of each connected part of those that are wide (T,), of parts that do not reach the border."""
+    at = np.flatnonzero(wide)
+    number = np.full(len(wide) + 1, -1)  # the last one: beyond the border
+    number[at] = np.arange(len(at))
+    to = number[outline.neighbors[at]]
+    rows, sides = np.nonzero(to >= 0)
+    _, part = connected_components(coo_array((np.ones(len(rows)), (rows, to[rows, sides])), shape=(len(at),) * 2), directed=False)
+    open_parts = np.unique(part[(outline.neighbors[at] < 0).any(axis=1)])
+    for each in np.setdiff1d(part, open_parts):
+        yield at[part == each]
 
 
 def _spanned(plane: Plane, on: np.ndarray) -> Support:

@@ -90,3 +90,18 @@ def test_patches_that_rays_go_on_through_are_no_table() -> None:
     support = of_patches(ring, hole)
     assert support is not None, "what is seen through the gap of a ring is no part of it"
     assert np.isinf(support.distances(np.array([[0.0, 0, 2]]), np.array([[0.0, 0, -1]]))[0])
+
+
+@pytest.mark.parametrize(
+    ("middle", "radius", "seen_through", "solid"),
+    [((0.6, 0.6), 0.25, False, True), ((0.6, 0.6), 0.25, True, False), ((1.0, 0.0), 0.25, False, False), ((-0.5, 1.0), 0.7, False, False)],
+    ids=["enclosed", "seen through", "at the edge", "large"],
+)
+def test_a_gap_that_patches_enclose_is_part_of_the_table(middle: tuple[float, float], radius: float, seen_through: bool, solid: bool) -> None:
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-1.5, 1, 51), np.linspace(-1, 2, 61)))
+    patches = np.column_stack([x, y, np.full(len(x), HEIGHT)])[np.hypot(x - middle[0], y - middle[1]) > radius]
+    below = np.array([[*middle, HEIGHT - 0.1]] * 3) if seen_through else np.zeros((0, 3))
+    support = of_patches(patches, below)
+    assert support is not None
+    distance = support.distances(np.array([[*middle, 2.0], [-0.9, -0.9, 2.0]]) - [0.01, 0, 0], np.tile([[0.0, 0, -1]], (2, 1)))
+    assert np.isfinite(distance).tolist() == [solid, True]
