@@ -126,7 +126,7 @@ def check(settings: Mapping[str, Any]) -> None:
 
 STAGE = Stage(
     name="poses",
-    version=24,
+    version=25,
     settings=PosesSettings,
     needs=(),
     run=ByName("stages.poses.run:run"),
