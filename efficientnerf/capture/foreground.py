@@ -49,13 +49,7 @@ NO_POINTS = np.zeros((0, 3))
 
 
 def find_subject(
-    points: np.ndarray,
-    views: np.ndarray,
-    pixels: np.ndarray,
-    cameras: Sequence[Camera],
-    *,
-    weights: np.ndarray | None = None,
-    known: Sequence[Plane] = (),
+    points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera], *, weights: np.ndarray | None = None, known: Sequence[Plane] = ()
 ) -> Foreground | None:
     """The foreground of a capture, in the training frame; None where the rays say too little.
 
@@ -112,8 +106,7 @@ def find_subject(
     if not planes:
         region = _region_of(found, cells.side, level=round_it, margin=WIDE_MARGIN)
     else:
-        region = _region_of(found, cells.side, cells.centres[support & close], level=level)
-        region = _ended_below([plane for plane in known if any(_same(plane, one) for one in planes)], region)
+        region = _ended_below(known, planes, _region_of(found, cells.side, cells.centres[support & close], level=level))
     return Foreground(region, cells.side, found, tuple(planes))
 
 
@@ -179,16 +172,12 @@ def _ending_in_view(cells: Cells, adjacent: np.ndarray, subject: np.ndarray, oth
     return out
 
 
-def _same(one: Plane, other: Plane) -> bool:
-    return one[1] == other[1] and bool((one[0] == other[0]).all())
-
-
-def _ended_below(planes: Sequence[Plane], region: Region) -> Region:
-    """The region without what is far below a level plane that is known: in the cells its place is known to a few of their sides alone."""
+def _ended_below(known: Sequence[Plane], planes: Sequence[Plane], region: Region) -> Region:
+    """The region without what is far below a level one of its planes that is known: in the cells its place is known to a few of their sides alone."""
     bounds = region.bounds.copy()
     size = float((bounds[1] - bounds[0]).max())
-    for normal, offset in planes:
-        if normal[2] > LEVEL:
+    for normal, offset in known:
+        if normal[2] > LEVEL and any(offset == other and (normal == one).all() for one, other in planes):
             lowest = (offset - np.maximum(normal[:2] * bounds[0, :2], normal[:2] * bounds[1, :2]).sum()) / normal[2]  # of its four corners
             bounds[0, 2] = max(bounds[0, 2], lowest - MARGIN * size)
     return replace(region, bounds=bounds)
