@@ -226,7 +226,8 @@ def support_of_patches(
 
 def _enclosed(outline: Delaunay, wide: np.ndarray) -> Iterator[np.ndarray]:
     """The triangles of each connected part of those that are wide (T,), of parts that do not reach the border."""
-    at = np.flatnonzero(wide)
+    if not len(at := np.flatnonzero(wide)):
+        return
     number = np.full(len(wide) + 1, -1)  # the last one: beyond the border
     number[at] = np.arange(len(at))
     to = number[outline.neighbors[at]]
