@@ -12,9 +12,10 @@ from efficientnerf.asset.tree import NerfTree
 from efficientnerf.surface.mesh import Mesh, Texture
 from efficientnerf.surface.shading import vertex_colours
 from efficientnerf.surface.texturing.asset import texture_of_asset
-from efficientnerf.surface.texturing.atlas import atlas_of
+from efficientnerf.surface.texturing.atlas import TooManyCharts, atlas_of
 from efficientnerf.surface.texturing.filling import texture_from
 from efficientnerf.surface.texturing.photographs import Photograph, PhotographTexture, exposed_alike, photograph, survey, texels_wanted
+from pipeline.errors import UsageError
 from stages.io.refined_cameras import load_scene
 from stages.io.scene import View, load, views_of
 from stages.train.averaged import averaged_views
@@ -32,9 +33,12 @@ def textured(mesh: Mesh, tree: NerfTree, captured: tuple[Path, Path], choice: st
     """
     if choice == "off":
         return mesh
-    found = None if choice == "asset" else _from_photographs(mesh, captured, largest, progress)
-    if found is None or (choice != "photographs" and not found.facts["texture_observed"]):
-        found = texture_of_asset(tree, mesh, largest=largest, progress=progress)
+    try:
+        found = None if choice == "asset" else _from_photographs(mesh, captured, largest, progress)
+        if found is None or (choice != "photographs" and not found.facts["texture_observed"]):
+            found = texture_of_asset(tree, mesh, largest=largest, progress=progress)
+    except TooManyCharts as error:
+        raise UsageError(f"mesh: {error}. Raise mesh.texture_size, or lower mesh.max_faces.") from error
     return replace(found, colours=vertex_colours(found))  # docs/experiments/vertex-colours.md
 
 

@@ -15,8 +15,13 @@ from efficientnerf.surface.texturing.charts import Charts, charts_of
 SMALLEST = 16  # texels along a side
 FILLED = 0.7  # share of a square that packed charts fill, about
 STEP = 0.97  # of the scale, until charts fit
+NOTHING = 1e-3  # of the scale that the charts' area allows: gaps alone do not fit
 MIN_SCALE = 0.8  # of the scale that is wanted, or that the charts' area alone allows
 GAP = 4  # texels between charts, at least; 1/512 of the side in larger textures
+
+
+class TooManyCharts(ValueError):
+    """The largest texture does not hold the gaps between a mesh's charts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +84,7 @@ def atlas_of(vertices: np.ndarray, faces: np.ndarray, scale: float, largest: int
     scale    texels for each unit of the mesh that are wanted
     largest  texels along a side, at most
 
-    The side is the smallest power of two that about holds them, or the largest; charts are as large as fit then.
+    The side is the smallest power of two that about holds them, or the largest; charts are as large as fit then. Raises TooManyCharts.
     """
     areas = face_areas(vertices, faces)
     area, extent = float(areas.sum()), float(np.ptp(vertices, 0).max(initial=0.0)) if len(vertices) else 0.0
@@ -88,12 +93,14 @@ def atlas_of(vertices: np.ndarray, faces: np.ndarray, scale: float, largest: int
     while True:
         fitting = min(size * np.sqrt(FILLED / max(area, 1e-300)), 2 * size / max(extent, 1e-300))  # long and narrow charts have little area
         charts = charts_of(vertices, faces, 1 / fitting)
-        at, placed = fitting / STEP**3, None
-        while placed is None:
+        least = (MIN_SCALE * min(scale, fitting) if scale > 0 else 0) if 2 * size <= largest else 0
+        at = fitting / STEP**3 * STEP
+        while (placed := _packed(charts, at, size)) is None and at * STEP >= max(least, NOTHING * fitting):
             at *= STEP
-            placed = _packed(charts, at, size)
-        if at >= MIN_SCALE * min(scale, fitting) or 2 * size > largest:
+        if placed is not None:
             return Atlas(placed, charts.chart, size, at)
+        if 2 * size > largest:
+            raise TooManyCharts(f"{charts.count} charts do not fit into {size} x {size} texels with gaps of {gap_of(size)} between them")
         size *= 2  # gaps take more space than charts
 
 

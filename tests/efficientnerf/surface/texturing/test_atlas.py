@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import binary_dilation
 
 from efficientnerf.surface.mesh import face_areas, face_neighbours
-from efficientnerf.surface.texturing.atlas import atlas_of, gap_of
+from efficientnerf.surface.texturing.atlas import TooManyCharts, atlas_of, gap_of
 from efficientnerf.surface.texturing.charts import charts_of
 from efficientnerf.surface.texturing.filling import texture_from
 
@@ -16,6 +16,13 @@ def rough(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """A ball that is pitted so that many faces look away."""
     vertices, faces = ball(3)
     return vertices + 0.06 * np.random.default_rng(seed).normal(size=vertices.shape), faces
+
+
+def scattered(count: int = 100) -> tuple[np.ndarray, np.ndarray]:
+    """Small boxes that lie apart: of charts that need more texels for the gaps between them than for themselves."""
+    vertices, faces = box()
+    away = np.random.default_rng(0).uniform(0, 10, (count, 3))
+    return (0.01 * vertices + away[:, None]).reshape(-1, 3), np.concatenate([faces + number * len(vertices) for number in range(count)])
 
 
 SHAPES = {"ball": ball, "box": box, "rough": rough}
@@ -138,3 +145,12 @@ def test_empty_texels_have_the_colour_of_the_nearest() -> None:
         same = (colours == texture[tuple(place)]).all(1)
         assert same.any()
         assert apart[same].min() <= 1.1 * apart.min() + 0.5  # chamfer distances
+
+
+def test_an_atlas_grows_where_gaps_alone_fill_it_and_an_end_comes_at_the_largest() -> None:
+    vertices, faces = scattered()
+    atlas = atlas_of(vertices, faces, 1.0, 4096)
+    assert atlas.size == 128, "600 charts of 5 x 5 texels with their gaps; 16 x 16 were wanted"
+    assert np.isfinite(atlas.corners).all()
+    with pytest.raises(TooManyCharts):
+        atlas_of(vertices, faces, 1.0, 32)
