@@ -261,6 +261,14 @@ def test_what_is_scattered_far_away_makes_no_cell_larger() -> None:
     np.testing.assert_array_equal(found.region.bounds, clean.region.bounds)
 
 
+def test_fog_in_which_hardly_a_ray_ends_where_others_do_has_no_subject() -> None:
+    cameras = ring(30, 2.5, 1.2)
+    points, views, pixels = cast(cameras, [ball([0, 0, 0], 0.5), ROOM])
+    kept = np.random.default_rng(0).random(len(points)) < 0.02
+    points[~kept] = np.inf  # the others end nowhere
+    assert find_subject(points, views, pixels, cameras) is None
+
+
 def test_a_subject_seen_from_one_side_is_whole() -> None:
     cameras = ring(16, 2.2, 0.6, arc=90)
     found = region(cameras, [box([-0.4, -0.4, -0.5], [0.4, 0.4, 0.7]), ROOM])
