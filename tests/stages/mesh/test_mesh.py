@@ -160,6 +160,16 @@ def test_the_texture_shows_what_was_asked_for(ball: Path, tmp_path: Path, choice
     assert np.abs(shown[top] - above).max(1).mean() < 0.05
 
 
+def test_more_charts_than_the_largest_texture_holds_name_the_settings(ball: Path, tmp_path: Path) -> None:
+    tree = format.load(ball / "asset.nerftree")
+    corners = np.array([[0.0, 0, 0], [0.02, 0, 0], [0, 0.02, 0]])
+    vertices = (corners + np.random.default_rng(0).uniform(-0.5, 0.5, (60, 1, 3))).reshape(-1, 3)
+    upwards = np.tile([[0.0, 0, 1]], (len(vertices), 1))
+    mesh = Mesh(vertices, np.arange(len(vertices)).reshape(-1, 3), upwards, np.full(vertices.shape, 0.5, np.float32), {})
+    with pytest.raises(UsageError, match=r"mesh\.texture_size"):
+        textured(mesh, tree, (tmp_path, tmp_path), "asset", 32, lambda done, total, text: None)
+
+
 def test_held_back_photographs_are_not_looked_at(ball: Path, tmp_path: Path) -> None:
     """Where all photographs but the training ones are gone, nothing changes."""
     poses = photograph_ball(tmp_path / "poses", splits=("train", "test", "train", "val"))
