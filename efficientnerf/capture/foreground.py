@@ -29,7 +29,7 @@ NEAR_QUANTILE = 0.35  # of a view's central distances: its subject, behind which
 OBSERVED, REACHED = 0.6, 0.05  # views of a cell over those of the cells with most: what is well observed; what the subject may still reach into
 FARTHEST, PATH_FARTHEST, LONGER = 1.6, 3.0, 1.2  # distance of a cell from its views over the usual distance, and of what is put into cells over that
 # docs/experiments/foreground.md
-MIN_KNOWN = 0.05  # of the central rays of all, that end where several views do: of captures 0.37 to 0.99, of fog 0.003
+MIN_ENDED = 0.05  # of the central rays of all, that end where several views do: of captures 0.37 to 0.99, of fog 0.003
 MIN_SHARE, MIN_PART = 0.2, 0.02  # of the central rays: that a subject holds at least; that a connected part of it does
 MARGIN, WIDE_MARGIN, SUPPORT_MARGIN, FADE = 0.06, 0.1, 0.25, 0.02  # of the longest side
 MIN_INNER, MIN_ENDING = 3, 0.7  # views that show a cell off their border, where a part ends in view; of the cells at its ends
@@ -79,7 +79,7 @@ def find_subject(
     focus, reach, converging = find_focus(points, views, pixels, cameras)
     cells = observed_cells(points, views, pixels, cameras, reach / CELLS_TO_FOCUS, LONGER * (FARTHEST if converging else PATH_FARTHEST) * reach)
     trusted = cells.trusted
-    if trusted.sum() < 10 or cells.central[trusted].sum() < MIN_KNOWN * weight_in_middle(pixels).sum():
+    if trusted.sum() < 10 or cells.central[trusted].sum() < MIN_ENDED * weight_in_middle(pixels).sum():
         return None
     if not converging:
         return Foreground(_region_of(cells.centres[trusted & (cells.distance <= PATH_FARTHEST * reach)], cells.side), cells.side, NO_POINTS)

@@ -89,7 +89,7 @@ def picture_of(grey: np.ndarray, usable: np.ndarray, camera: Camera, points: np.
 class SweptPlane:
     """A plane, and the patches that two photographs agree on along it."""
 
-    normal: np.ndarray  # (3,) upwards
+    normal: np.ndarray  # (3,) towards the subject
     offset: float
     xyz: np.ndarray  # (P, 3)
     cameras: np.ndarray  # (P, 2, 3) where those that show each stand

@@ -93,7 +93,7 @@ def atlas_of(vertices: np.ndarray, faces: np.ndarray, scale: float, largest: int
     while True:
         fitting = min(size * np.sqrt(FILLED / max(area, 1e-300)), 2 * size / max(extent, 1e-300))  # long and narrow charts have little area
         charts = charts_of(vertices, faces, 1 / fitting)
-        least = (MIN_SCALE * min(scale, fitting) if scale > 0 else 0) if 2 * size <= largest else 0
+        least = MIN_SCALE * min(scale, fitting) if scale > 0 and 2 * size <= largest else 0
         at = fitting / STEP**3 * STEP
         while (placed := _packed(charts, at, size)) is None and at * STEP >= max(least, NOTHING * fitting):
             at *= STEP
