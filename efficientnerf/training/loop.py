@@ -27,6 +27,7 @@ from efficientnerf.sampling.occupancy import mask_cells, open_cells
 from efficientnerf.sampling.strategies import Efficient
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.exposure.model import Exposure, is_learned
+from efficientnerf.training.losses import spares_highlights
 from efficientnerf.training.occupancy_update import update_in_turn
 from efficientnerf.training.optimiser import Adam, ParameterGroup, parameter_groups
 from efficientnerf.training.pixels import Pixels
@@ -155,7 +156,7 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
             rays = len(inputs.rays.pixel) + aimed
             # Aimed rays begin closer to the camera, and end farther away.
             capacity = None if readback is None else readback.capacity(rays + aimed)
-            plan = StepPlan(prune, samples_per_pivot, capacity, is_learned(fraction))
+            plan = StepPlan(prune, samples_per_pivot, capacity, is_learned(fraction), spares_highlights(m, fraction))
             if readback is None:
                 fine_loss, outputs = step_on_rays(learner, plan, sent(inputs, m.device), numbers, rng)
                 counts, empty = _counted(t, rays, fine_loss, outputs, samples_per_pivot), len(outputs.coarse.start) == 0

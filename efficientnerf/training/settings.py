@@ -100,6 +100,12 @@ class TrainSettings:
         " and costs other captures up to half a decibel.",
         advanced=True,
     )
+    highlight_loss_weight: Fraction = setting(
+        1.0,
+        "Weight, in the first two fifths of the steps, of colour losses where a photograph is brighter than what the field shows in or behind the box of a"
+        " contracted scene, unless that is bright: 0.1 keeps highlights from making dark glossy things hollow, and costs 0.1 to 0.3 dB.",
+        advanced=True,
+    )
     exposure: Literal["auto", "off", "on"] = setting(
         "auto",
         "Whether unbounded scenes learn the exposure and white balance of each photograph, and the vignetting and response of each camera; auto: where"

@@ -11,7 +11,7 @@ from efficientnerf.model import Model, RayOutputs, render_rays
 from efficientnerf.sampling.samples import SampleCapacity, complete_rays
 from efficientnerf.training.device_pixels import DevicePixels, on_host
 from efficientnerf.training.exposure.model import Exposure, exposure_loss, places
-from efficientnerf.training.losses import colour_losses, mean_over, scale_gradients_by_distance
+from efficientnerf.training.losses import colour_losses, crosses_box, mean_over, scale_gradients_by_distance
 from efficientnerf.training.occupancy_update import update_on_rays
 from efficientnerf.training.optimiser import Adam, StepSize
 from efficientnerf.training.pixels import Pixels
@@ -58,6 +58,7 @@ class StepPlan(NamedTuple):
     samples_per_pivot: int
     capacity: SampleCapacity | None  # None: samples are counted
     learns_exposure: bool
+    spares_highlights: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +119,7 @@ def build_rays(m: Model, pixels: Pixels | DevicePixels, drawn: DrawnRays) -> tup
 
 
 def step_on_rays(learner: Learner, plan: StepPlan, inputs: StepInputs, numbers: StepNumbers, rng: np.random.Generator) -> tuple[Tensor, RayOutputs]:
-    """The step, but for `efficientnerf.training.occupancy_update.update_in_turn`: mean squared error of the fine colours, and the rays before the step.
+    """The step, but for `efficientnerf.training.occupancy_update.update_in_turn`: the first of `colour_losses`, and the rays before the step.
 
     inputs  tensors on the model's device
     rng     of strategies that draw as they sample
@@ -132,7 +133,8 @@ def step_on_rays(learner: Learner, plan: StepPlan, inputs: StepInputs, numbers: 
     fitting = complete_rays(outputs.coarse, outputs.fine)
     complete = None if fitting is None else fitting[:count]
     exposure = learner.exposure if learner.exposure is None or plan.learns_exposure else learner.exposure.detached
-    fine_loss, coarse_loss = colour_losses(outputs, colour, complete, inputs.place, exposure)
+    highlights = (crosses_box(m, origins, bundle[1][:count]), m.settings.highlight_loss_weight) if plan.spares_highlights else None
+    fine_loss, coarse_loss = colour_losses(outputs, colour, complete, inputs.place, exposure, highlights)
     loss = fine_loss if coarse_loss is None else fine_loss + coarse_loss  # weighted equally, as in the authors' release
     if exposure is not None:
         loss = loss + exposure_loss(exposure)

@@ -60,8 +60,7 @@ def trained(job: Job) -> bool:
     m = model(space, replace(settings, exposure="off" if exposure is None else "on"), s.background, job.device, (near, far))
     if (sky := begin_sky(m, pixels)) is not None:
         job.say(f"the sky begins with {sky}")
-    if settings.plain_loss_weight > 0 and not (space.contracted and pixels.images.shape[1] == 3):
-        job.say("train.plain_loss_weight has no effect: it is for contracted scenes of photographs without alpha")
+    say_what_has_no_effect(job, space.contracted, alpha=pixels.images.shape[1] == 4)
     priors = mask_uncovered_cells(m, views, job)
 
     t = loop.trainer(m, exposure, cameras=[view.camera for view in views], closed=cells_closed_at_first(m, views, folder))
@@ -100,6 +99,14 @@ def trained(job: Job) -> bool:
     log.publish(outputs.log, outputs.curve)
     previews.publish(outputs.previews, job.warn)
     return True
+
+
+def say_what_has_no_effect(job: Job, contracted: bool, *, alpha: bool) -> None:
+    """Name settings of contracted scenes where the scene is none."""
+    if job.settings.plain_loss_weight > 0 and (alpha or not contracted):
+        job.say("train.plain_loss_weight has no effect: it is for contracted scenes of photographs without alpha")
+    if job.settings.highlight_loss_weight < 1 and not contracted:
+        job.say("train.highlight_loss_weight has no effect: it is for contracted scenes")
 
 
 def sparse_depth(job: Job, folder: Path, s: Scene, m: Model, pixels: Pixels, views: tuple[View, ...]) -> SparseDepthRays | None:

@@ -48,12 +48,13 @@ def checkpoints(made: Job) -> list[str]:
     return sorted(path.name for path in made.work.glob("checkpoint_*"))
 
 
-@pytest.mark.parametrize("weight", [0.0, 0.01])
-def test_a_loss_without_effect_is_reported(weight: float, scene: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "idle", "weight"), [("plain_loss_weight", 0.0, 0.01), ("highlight_loss_weight", 1.0, 0.1)])
+def test_a_loss_without_effect_is_reported(name: str, idle: float, weight: float, scene: Path, tmp_path: Path) -> None:
     """The ball has alpha and a constant background."""
-    events: list[dict[str, Any]] = []
-    train.run(job(tmp_path, settings(**{**QUICK, "iterations": 3}, plain_loss_weight=weight), poses=scene, events=events))
-    assert any("train.plain_loss_weight" in str(event.get("text")) for event in events) == (weight > 0)
+    for value in (idle, weight):
+        events: list[dict[str, Any]] = []
+        train.run(job(tmp_path / str(value), settings(**{**QUICK, "iterations": 3, name: value}), poses=scene, events=events))
+        assert any(f"train.{name}" in str(event.get("text")) for event in events) == (value == weight)
 
 
 def test_it_leaves_a_field_a_log_a_curve_and_previews(scene: Path, tmp_path: Path, undisturbed: str) -> None:
